@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from support.faults import inject
-from support.published import files, make_published, parameters
+from support.published import IDS, files, make_published, parameters
 from support.synthetic import Dataset, Made
 
 from slatprep.pipeline.dataset import build_store
@@ -51,7 +51,16 @@ def built(three: Made, tmp_path: Path) -> Made:
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_published(tmp_path_factory.mktemp("published"))
+    """Make the published dataset, with folders beside the grids that hold none."""
+    folder = make_published(tmp_path_factory.mktemp("published"))
+    for other in ("data", "outputs"):
+        (folder / "pixieverse" / other / IDS[0]).mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def objects(made: Path) -> Path:
+    return made / "pixieverse" / "render_outputs"
 
 
 @pytest.fixture(scope="session")

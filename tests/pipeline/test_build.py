@@ -1,15 +1,14 @@
 import json
-from dataclasses import replace
+import shutil
 
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import JELLY, METAL, make_asset
+from support.synthetic import JELLY, METAL, Dataset, MakeDataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import PairingParameters, SampleParameters
 from slatprep.pipeline.dataset import align_pairs, build_store
 from slatprep.store import open_store
 from slatprep.store.manifests import manifests_of
@@ -36,18 +35,11 @@ def test_two_jobs_write_the_same_bytes_as_one(mixed, mixed_build, tmp_path):
     assert records_of(mixed_build.records) == records_of(again.records)
 
 
-def test_the_dataset_can_lie_elsewhere(make_dataset, tmp_path):
-    dataset = make_dataset("a")
-    first = build_store(dataset.parameters(), tmp_path / "first.zarr")
-    dataset.root = dataset.root.rename(tmp_path / "moved")
-    second = build_store(dataset.parameters(), tmp_path / "second.zarr")
-    assert tree(second.store) == tree(first.store)
-
-
-def test_progress_counts_every_asset(mixed, tmp_path):
-    seen: list[tuple[int, int]] = []
-    align_pairs(mixed.parameters(), tmp_path / "a.jsonl", progress=lambda *done: seen.append(done))
-    assert seen == [(k, 7) for k in range(8)]
+def test_the_dataset_can_lie_elsewhere(undisturbed, tmp_path):
+    dataset, first = undisturbed
+    moved = Dataset(shutil.copytree(dataset.root, tmp_path / "moved"))
+    build_store(moved.parameters("pixie"), tmp_path / "s.zarr")
+    assert tree(tmp_path / "s.zarr") == tree(first)
 
 
 def test_strict_stops_at_the_first(make_dataset, tmp_path):
@@ -77,28 +69,39 @@ def test_an_error_of_our_own_is_marked_and_costs_one_asset(make_dataset, tmp_pat
 
 
 def test_no_usable_asset_is_an_error_and_keeps_the_old_store(make_dataset, tmp_path):
-    dataset = make_dataset("a")
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    before = tree(tmp_path / "s.zarr"), tree(tmp_path / "s.manifests")
+    dataset, out = make_dataset("a"), tmp_path / "s.zarr"
+    build_store(dataset.parameters(), out)
+    before = tree(out), tree(tmp_path / "s.manifests")
     dataset.write_slat("a.npz", np.zeros((1, 3), np.uint8), np.zeros((1, 7), np.float32))
     with pytest.raises(StoreError, match=r"none of 1 assets can be used.*\n  a: .*a\.npz"):
-        build_store(dataset.parameters(), tmp_path / "s.zarr")
-    assert (tree(tmp_path / "s.zarr"), tree(tmp_path / "s.manifests")) == before
-    assert len(open_store(summary.store)) == 1
+        build_store(dataset.parameters(), out)
+    assert (tree(out), tree(tmp_path / "s.manifests")) == before
+    assert len(open_store(out)) == 1
 
 
-def test_a_build_that_is_stopped_midway_leaves_the_old_store(make_dataset, tmp_path):
-    dataset = make_dataset("a", "b")
-    build_store(dataset.parameters(), tmp_path / "s.zarr")
-    before = tree(tmp_path)
+def stop(*reached: object) -> None:
+    """Stand at a seam, or where progress is told, and press Ctrl-C."""
+    raise KeyboardInterrupt
 
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
 
+def test_a_build_that_is_stopped_midway_leaves_the_old_store(built):
+    dataset, out = built
+    before = tree(out.parent)
     with pytest.raises(KeyboardInterrupt):
-        build_store(dataset.parameters("pixie"), tmp_path / "s.zarr", progress=stop)
-    after = tree(tmp_path)
-    assert {name: after[name] for name in before} == before
+        build_store(dataset.parameters("pixie"), out, progress=stop)
+    assert before.items() <= tree(out.parent).items()
+
+
+@pytest.mark.parametrize("step", ["work folder made", "work folder locked"])
+def test_a_build_that_is_stopped_as_it_begins_leaves_nothing(
+    make_dataset, tmp_path, monkeypatch, step
+):
+    dataset = make_dataset("a")
+    before = sorted(tmp_path.iterdir())
+    inject(monkeypatch, lambda reached, name: reached == step and stop())
+    with pytest.raises(KeyboardInterrupt):
+        build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_folders_instead_of_parameters_are_answered_with_what_to_give(tmp_path):
@@ -152,7 +155,8 @@ def test_ranges_by_name_clip_and_count(make_dataset, tmp_path):
     dataset = make_dataset("a")
     summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr")
     # Pixie's ranges: log10 E to 10.88 (metal has 11.3), log10 density to 3.87 (metal has 3.90).
-    asset = open_store(summary.store).asset("a")
+    store = open_store(summary.store)
+    asset = store.asset("a")
     metal = asset.material == METAL[0]
     assert 0 < metal.sum() < len(metal)
     assert (asset.properties[metal, :2] == 1.0).all()
@@ -161,12 +165,8 @@ def test_ranges_by_name_clip_and_count(make_dataset, tmp_path):
     )
     in_voxels = int(metal.sum())
     in_grid = int((dataset.assets["a"].grid[..., 3] == METAL[0]).sum())
-    assert summary.clipped == {
-        "youngs_modulus": in_voxels,
-        "density": in_voxels,
-        "poissons_ratio": 0,
-    }
-    store = open_store(summary.store)
+    clipped = {"youngs_modulus": in_voxels, "density": in_voxels, "poissons_ratio": 0}
+    assert summary.clipped == clipped
     assert store.column("clipped").tolist() == [[in_voxels, in_voxels, 0]]
     assert store.column("clipped_grid").tolist() == [[in_grid, in_grid, 0]]
 
@@ -187,28 +187,11 @@ def test_ranges_from_a_file(make_dataset, tmp_path):
     assert open_store(summary.store).normalization.source == "ranges.toml"
 
 
-def test_ranges_that_cannot_be_read_are_told_before_any_work(make_dataset, tmp_path):
-    def never(done: int, total: int) -> None:
-        raise AssertionError("an asset was aligned first")
-
+def test_ranges_that_cannot_be_read_are_told_before_any_work(make_dataset, tmp_path, steps):
     parameters = make_dataset("a").parameters(str(tmp_path / "none.toml"))
     with pytest.raises(ConfigError, match=r"none\.toml: cannot read ranges"):
-        build_store(parameters, tmp_path / "s.zarr", progress=never)
-
-
-def test_islands_without_annotation_stay_occupied(make_dataset, tmp_path):
-    dataset = make_dataset("a")
-    grid = dataset.assets["a"].grid
-    grid[30, 25:28, 28, 3] = -1
-    dataset.write_grid("a", grid)
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    asset = open_store(summary.store).asset("a")
-    assert (asset.grid_material[30, 25:28, 28] == 255).all()
-    assert np.isnan(asset.grid_properties[:, 30, 25:28, 28]).all()
-    assert (asset.material < 7).all()
-    counts = records_of(summary.records)["a"]["counts"]
-    assert counts["unannotated"] == 3
-    assert counts["occupied"] == counts["annotated"] + 3 == (grid[..., 3] != 7).sum()
+        build_store(parameters, tmp_path / "s.zarr")
+    assert steps == []
 
 
 def test_names_without_anything_in_common_are_told_in_one_line(make_dataset, tmp_path):
@@ -226,7 +209,7 @@ def test_names_without_anything_in_common_are_told_in_one_line(make_dataset, tmp
     table.write_text("object_id,slat_id\nother,thing\n")
     with pytest.raises(StoreError, match=rf"--map {table} "):
         build_store(dataset.parameters(), tmp_path / "s.zarr")
-    parameters = replace(dataset.parameters(), pairing=PairingParameters(map=table))
+    parameters = dataset.parameters(pairing={"map": table})
     with pytest.raises(StoreError) as caught:
         build_store(parameters, tmp_path / "s.zarr")
     assert "\n" not in str(caught.value)
@@ -235,48 +218,57 @@ def test_names_without_anything_in_common_are_told_in_one_line(make_dataset, tmp
     assert build_store(parameters, tmp_path / "s.zarr").statuses["ok"] == 1
 
 
-def test_no_asset_is_lost_to_one_unphysical_voxel(make_dataset, tmp_path):
-    dataset = make_dataset("a", "b")
-    grid = dataset.assets["a"].grid
-    grid[30, 25:28, 28, 2] = 0.546
-    dataset.write_grid("a", grid)
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+FAR = np.array([[1, 1, 1], [2, 1, 1]], np.uint8)
+
+
+@pytest.fixture
+def odd(make_dataset: MakeDataset) -> Dataset:
+    """Three voxels of ``a`` are unphysical, three of ``b`` are islands, two of ``c`` far off."""
+    dataset = make_dataset("a", "b", "c")
+    for name, channel, value in (("a", 2, 0.546), ("b", 3, -1)):
+        grid = dataset.assets[name].grid
+        grid[30, 25:28, 28, channel] = value
+        dataset.write_grid(name, grid)
+    made = dataset.assets["c"]
+    coords = np.concatenate([FAR, made.coords])
+    dataset.write_slat("c.npz", coords, np.resize(made.feats, (len(coords), 8)))
+    return dataset
+
+
+def test_no_asset_is_lost_to_a_few_odd_voxels(odd, tmp_path):
+    out = tmp_path / "s.zarr"
+    summary = build_store(odd.parameters(), out)
     assert summary.complete
     assert summary.n_unphysical == 3
-    store = open_store(summary.store)
-    asset = store.asset("a")
-    assert (asset.grid_material[30, 25:28, 28] == 255).all()
-    assert np.isnan(asset.grid_properties[:, 30, 25:28, 28]).all()
-    assert store.column("unphysical").tolist() == [3, 0]
+    store, records = open_store(out), records_of(summary.records)
+    for name in "ab":
+        asset = store.asset(name)
+        assert (asset.grid_material[30, 25:28, 28] == 255).all()
+        assert np.isnan(asset.grid_properties[:, 30, 25:28, 28]).all()
+        assert (asset.material < 7).all()
+        counts = records[name]["counts"]
+        assert counts["unphysical"] == (3 if name == "a" else 0)
+        assert counts["unannotated"] == 3
+        of_grid = (odd.assets[name].grid[..., 3] != 7).sum()
+        assert counts["occupied"] == counts["annotated"] + 3 == of_grid
+    assert store.column("unphysical").tolist() == [3, 0, 0]
     assert store.normalization.ranges[2].hi == pytest.approx(0.3)
-    record = records_of(summary.records)["a"]
-    assert record["counts"]["unphysical"] == record["counts"]["unannotated"] == 3
-    assert record["parameters"]["sample"]["max_unphysical"] == 0.1
-    assert "3 voxels are unphysical" in record["warnings"][0]
+    assert records["a"]["parameters"]["sample"]["max_unphysical"] == 0.1
+    assert "3 voxels are unphysical" in records["a"]["warnings"][0]
     build = json.loads((summary.records.parent / "build.json").read_bytes())
     assert build["counts"]["unphysical"] == 3
-    assert verify_store(summary.store, sources=True).ok
 
-    again = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    assert again.n_unphysical == 3
-    strict = replace(dataset.parameters(), sample=SampleParameters(max_unphysical=0.0))
-    refused = build_store(strict, tmp_path / "s.zarr")
-    assert [asset_id for asset_id, _ in refused.problems] == ["a"]
-
-
-def test_voxels_too_far_from_an_annotation_are_not_valid(make_dataset, tmp_path):
-    dataset = make_dataset("a")
-    made = dataset.assets["a"]
-    far = np.array([[1, 1, 1], [2, 1, 1]], np.uint8)
-    coords = np.concatenate([far, made.coords])
-    dataset.write_slat("a.npz", coords, np.resize(made.feats, (len(coords), 8)))
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    asset = open_store(summary.store).asset("a")
-    assert asset.valid.tolist() == [False, False] + [True] * len(made.coords)
-    assert asset.material[:2].tolist() == [255, 255]
-    assert np.isnan(asset.properties[:2]).all()
-    assert (asset.distance[:2] > 3.0).all()
+    far = store.asset("c")
+    assert far.valid.tolist() == [False, False] + [True] * len(odd.assets["c"].coords)
+    assert far.material[:2].tolist() == [255, 255]
+    assert np.isnan(far.properties[:2]).all()
+    assert (far.distance[:2] > 3.0).all()
     assert summary.n_valid == summary.n_voxels - 2
+    assert verify_store(out, sources=True).ok
+
+    assert build_store(odd.parameters(), out).n_unphysical == 3
+    strict = odd.parameters(sample={"max_unphysical": 0.0})
+    assert [asset_id for asset_id, _ in build_store(strict, out).problems] == ["a"]
 
 
 def test_manifests_go_where_asked(make_dataset, tmp_path):
@@ -287,8 +279,12 @@ def test_manifests_go_where_asked(make_dataset, tmp_path):
     assert not manifests_of(tmp_path / "s.zarr").exists()
 
 
-def test_alignment_alone_gives_the_stores_transforms(mixed, mixed_build, tmp_path):
-    summary = align_pairs(mixed.parameters(), tmp_path / "out" / "mixed.jsonl")
+def test_alignment_alone_counts_every_asset_and_gives_the_stores_transforms(
+    mixed, mixed_build, tmp_path
+):
+    out, seen = tmp_path / "out" / "mixed.jsonl", list[tuple[int, int]]()
+    summary = align_pairs(mixed.parameters(), out, progress=lambda *done: seen.append(done))
+    assert seen == [(k, 7) for k in range(8)]
     assert summary.store is None
     assert summary.statuses == mixed_build.statuses
     aligned, built = records_of(summary.records), records_of(mixed_build.records)
@@ -299,37 +295,11 @@ def test_alignment_alone_gives_the_stores_transforms(mixed, mixed_build, tmp_pat
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mixed.jsonl"]
 
 
-def test_other_parameters_make_another_build_id(make_dataset, tmp_path):
-    parameters = make_dataset("a").parameters()
-    first = align_pairs(parameters, tmp_path / "1.jsonl").build_id
-    assert align_pairs(parameters, tmp_path / "2.jsonl").build_id == first
-    nearer = replace(parameters, sample=replace(parameters.sample, max_distance=2.0))
-    assert align_pairs(nearer, tmp_path / "3.jsonl").build_id != first
-
-
-def test_no_store_is_built_inside_another(make_dataset, tmp_path):
+def test_no_store_is_built_inside_another(built):
     """The next build of the outer one would remove it as a stray."""
-    data = make_dataset("a")
-    outer = tmp_path / "outer.zarr"
-    build_store(data.parameters(), outer)
+    dataset, outer = built
     before = tree(outer)
     for inner in (outer / "inner.zarr", outer / "asset" / "deep" / "inner.zarr"):
-        with pytest.raises(ConfigError, match=r"lies inside the store .*outer\.zarr"):
-            build_store(data.parameters(), inner)
+        with pytest.raises(ConfigError, match=r"lies inside the store .*s\.zarr"):
+            build_store(dataset.parameters(), inner)
     assert tree(outer) == before
-
-
-@pytest.mark.parametrize("step", ["work folder made", "work folder locked"])
-def test_a_build_that_is_stopped_as_it_begins_leaves_nothing(
-    make_dataset, tmp_path, monkeypatch, step
-):
-    def stop(reached: str, name: str) -> None:
-        if reached == step:
-            raise KeyboardInterrupt
-
-    dataset = make_dataset("a")
-    before = sorted(tmp_path.iterdir())
-    inject(monkeypatch, stop)
-    with pytest.raises(KeyboardInterrupt):
-        build_store(dataset.parameters(), tmp_path / "s.zarr")
-    assert sorted(tmp_path.iterdir()) == before

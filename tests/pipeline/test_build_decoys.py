@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
+from support.trees import tree
 
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import build_store
@@ -22,11 +21,6 @@ def few_suffice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decoys, "EVERY", 2)
 
 
-def files_of(folder: Path) -> dict[str, bytes]:
-    files = (file for file in folder.rglob("*") if file.is_file())
-    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
-
-
 @pytest.mark.usefixtures("few_suffice")
 def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, tmp_path):
     parameters = make_dataset(*OBJECTS).parameters()
@@ -38,7 +32,7 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, t
     assert measured is not None
     assert len(measured.decoys) == len(OBJECTS) // decoys.EVERY
     assert (manifests_of(one) / FILE).read_bytes() == (manifests_of(two) / FILE).read_bytes()
-    assert files_of(one) == files_of(two) == files_of(none)
+    assert tree(one) == tree(two) == tree(none)
     assert not (manifests_of(none) / FILE).exists()
     assert told_of(open_store(none))[0].startswith("not measured; run")
 

@@ -2,12 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import zarr
-from support.trees import records_of, tree
+from support.trees import records_beside, tree
 
 from slatprep.demo import make_demo
 from slatprep.inspect.check import check_alignment
@@ -36,10 +35,6 @@ def stores(habitual: tuple[Path, BuildParameters]) -> tuple[Path, Path]:
     return alone, together
 
 
-def records_beside(store: Path) -> dict[str, dict[str, Any]]:
-    return records_of(store.with_suffix(".manifests") / "assets.jsonl")
-
-
 def test_more_symmetric_assets_are_placed_right_and_no_other_changes(habitual, stores):
     truth = habitual[0] / "truth"
     before, after = (score_against_truth(store, truth).assets for store in stores)
@@ -53,9 +48,7 @@ def test_more_symmetric_assets_are_placed_right_and_no_other_changes(habitual, s
     ]
     assert accuracy[1] >= accuracy[0]
 
-    alone, together = (
-        records_of(store.with_suffix(".manifests") / "assets.jsonl") for store in stores
-    )
+    alone, together = map(records_beside, stores)
     groups = [zarr.open_group(store, mode="r") for store in stores]
     for row, asset_id in enumerate(alone):
         if not alone[asset_id]["alignment"]["placements"]:
@@ -68,9 +61,7 @@ def test_more_symmetric_assets_are_placed_right_and_no_other_changes(habitual, s
 
 
 def test_what_was_settled_is_recorded_and_can_be_undone(stores):
-    alone, together = (
-        records_of(store.with_suffix(".manifests") / "assets.jsonl") for store in stores
-    )
+    alone, together = map(records_beside, stores)
     settled = [k for k, record in together.items() if record["alignment"]["settled_by"]]
     assert settled
     for asset_id in settled:

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from support.commands import run
 
-from slatprep.cli.commands import slatprep
 from slatprep.inspect.pictures.errors import draw_errors
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.pipeline.decoys import FILE, draw_decoys, measure_errors, measured_errors, told_of
@@ -76,8 +75,7 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
 
 def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store):
     measured = measure_errors(store, decoys=3, seed=1)
-    shown = CliRunner().invoke(slatprep, ["info", str(store.path)])
-    assert shown.exit_code == 0
+    shown = run("info", store.path)
     assert all(sentence in shown.output for sentence in measured.sentences())
     file = manifests_of(store.path) / FILE
     document = json.loads(file.read_bytes())
@@ -91,9 +89,8 @@ def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store):
 
 def test_the_command_says_how_many_are_wrong(store, tmp_path):
     picture = tmp_path / "errors.svg"
-    options = ["--decoys", "3", "--seed", "1", "--picture", str(picture)]
-    shown = CliRunner().invoke(slatprep, ["measure-errors", str(store.path), *options, "--json"])
-    assert shown.exit_code == 0, shown.output
+    options = ("--decoys", 3, "--seed", 1, "--picture", picture)
+    shown = run("measure-errors", store.path, *options, "--json")
     found = json.loads(shown.stdout)
     assert found["decoys"] == 3 and found["assets"] == len(store)
     assert set(found["errors"]) <= set(store.ids)
@@ -103,10 +100,9 @@ def test_the_command_says_how_many_are_wrong(store, tmp_path):
 def test_an_asset_is_told_its_probability_of_an_error(store):
     measured = measure_errors(store, decoys=3, seed=1)
     asset_id = store.ids[0]
-    options = ["check-alignment", "--asset", asset_id, "--store", str(store.path)]
-    shown = CliRunner().invoke(slatprep, [*options, "--picture", "none"])
-    assert measured.of_asset(asset_id) in shown.output
-    shown = CliRunner().invoke(slatprep, [*options, "--picture", "none", "--json"])
+    words = ("check-alignment", "--asset", asset_id, "--store", store.path, "--picture", "none")
+    assert measured.of_asset(asset_id) in run(*words).output
+    shown = run(*words, "--json")
     (found,) = json.loads(shown.stdout)["assets"]
     assert found["another_object"] == measured.errors.get(asset_id, 0.0)
     assert "is below 0.1%" in replace(measured, errors={}).of_asset(asset_id)

@@ -28,17 +28,6 @@ def test_statements_count_and_words_do_not(tmp_path, monkeypatch):
     assert of("def f(x):\n    return x + 2\n") != first
 
 
-def test_every_reader_counts():
-    readers = {name.partition(":")[0] for name in [*SOURCES.values(), *LATENTS.values()]}
-    assert readers <= set(numeric_modules())
-
-
-def test_it_is_the_same_in_another_process():
-    code = "from slatprep.pipeline.fingerprint import code_fingerprint; print(code_fingerprint())"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == code_fingerprint()
-
-
 def test_a_tree_is_written_alike_under_every_python():
     text = "class C[T]: x: int = None" if sys.version_info >= (3, 12) else "class C: x: int = None"
     tree = ast.parse("def f(a, *, b=[]): return f'{a!r:>{b}}' 'x'")
@@ -67,16 +56,19 @@ def test_it_is_the_same_under_another_python(minor):
     assert told.stdout.strip() == code_fingerprint()
 
 
-def test_it_covers_every_module_that_an_asset_runs_through():
+def test_it_covers_every_module_that_an_asset_runs_through_and_is_the_same_elsewhere():
     """Trace what is loaded for one asset, in a process that has loaded nothing else."""
     code = (
         "import sys; from slatprep.readers.pixieverse import read_grid; "
         "from slatprep.readers.slat import read_slat; from slatprep.sample import sample; "
         "from slatprep.judge import judge; from slatprep.align import quality, field; "
-        "print(*(m for m in sys.modules if m.startswith('slatprep')))"
+        "print(*(m for m in sys.modules if m.startswith('slatprep'))); "
+        "from slatprep.pipeline.fingerprint import code_fingerprint; print(code_fingerprint())"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = set(told.stdout.split())
+    modules, key = told.stdout.splitlines()
+    assert key == code_fingerprint()
+    loaded = set(modules.split())
     # Packages that only gather names, words of errors, and values that the key holds.
     uncounted = {
         "slatprep",
@@ -93,17 +85,14 @@ def test_it_covers_every_module_that_an_asset_runs_through():
     assert loaded - set(numeric_modules()) <= uncounted | finding | carrying
 
 
-@pytest.mark.parametrize("name", ["pipeline.annotate", "storage.chunks", "storage.codecs"])
-def test_what_merges_annotations_and_unpacks_values_is_in_it(name):
-    assert f"slatprep.{name}" in numeric_modules()
-
-
-def test_what_makes_no_numbers_is_not_in_it():
-    names = set(numeric_modules())
-    assert not {n for n in names if n.startswith("slatprep.storage.pl")}
-    assert not {n for n in names if n.startswith(("slatprep.cli", "slatprep.store"))}
-    assert "slatprep.pipeline.dataset" not in names
-    for path in numeric_modules().values():
+def test_what_makes_numbers_is_in_it_and_nothing_else():
+    modules = numeric_modules()
+    readers = {name.partition(":")[0] for name in [*SOURCES.values(), *LATENTS.values()]}
+    merging = {f"slatprep.{name}" for name in ("pipeline.annotate", "storage.chunks")}
+    assert readers | merging | {"slatprep.storage.codecs"} <= modules.keys()
+    others = ("slatprep.storage.pl", "slatprep.cli", "slatprep.store")
+    assert not [name for name in modules if name.startswith((*others, "slatprep.pipeline.dataset"))]
+    for path in modules.values():
         ast.parse(path.read_text())
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial import cKDTree
+from support.commands import run
 
 from slatprep import (
     build_store,
@@ -16,7 +16,6 @@ from slatprep import (
     open_store,
     subset_store,
 )
-from slatprep.cli.commands import slatprep as command
 from slatprep.demo import make_demo
 from slatprep.demo.latents import Encoder
 from slatprep.errors import ConfigError
@@ -102,18 +101,8 @@ def test_a_store_of_another_grid_is_sound_and_can_be_shown(demo, tmp_path):
     way = StoredRecords(store).place_map(asset)
     for level in (FULL, COARSE):
         assert len(encode_asset(asset, way, 2.0, level)) > 100
-    picture = tmp_path / "pictures"
-    said = (
-        "check-alignment",
-        "--store",
-        demo / "s.zarr",
-        "--asset",
-        asset.asset_id,
-        "--picture",
-        picture,
-    )
-    result = CliRunner().invoke(command, list(map(str, said)))
-    assert result.exit_code == 0, result.output
+    picture = ("--picture", tmp_path / "pictures")
+    run("check-alignment", "--store", demo / "s.zarr", "--asset", asset.asset_id, *picture)
 
 
 def test_its_points_are_the_voxels_centres(demo, tmp_path):
@@ -175,21 +164,17 @@ def test_stores_of_other_grids_are_not_joined_and_have_no_voxel_in_common(demo, 
 
 
 def test_a_decoder_is_trained_and_used_on_its_grid(demo, tmp_path):
-    run = tmp_path / "run"
+    trained = tmp_path / "run"
     chosen = TrainParameters(epochs=1, size="small", keep="last", shares=Shares(0.5, 0.0, 0.5))
-    train(demo / "s.zarr", run, chosen)
+    train(demo / "s.zarr", trained, chosen)
     out = tmp_path / "predictions"
-    words = ("predict", demo / "s.zarr", "--checkpoint", run, "--out", out)
-    result = CliRunner().invoke(command, list(map(str, words)))
-    assert result.exit_code == 0, result.output
+    run("predict", demo / "s.zarr", "--checkpoint", trained, "--out", out)
     store = open_store(demo / "s.zarr")
     for asset_id in store.ids:
         with np.load(out / f"{asset_id}.npz") as arrays:
             assert arrays["resolution"] == side_of(demo)
         assert len(predicted_field(out / f"{asset_id}.npz", None).voxels) > 100
-    words = ("evaluate", out, "--store", demo / "s.zarr", "--split", "all")
-    result = CliRunner().invoke(command, list(map(str, words)))
-    assert result.exit_code == 0, result.output
+    run("evaluate", out, "--store", demo / "s.zarr", "--split", "all")
 
 
 @pytest.mark.parametrize("side", [32, 96])

@@ -3,44 +3,37 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from support.synthetic import Dataset, Made
+from support.commands import run
+from support.made_store import edit_attributes
+from support.synthetic import Dataset
 from support.trees import records_of, tree
 
-from slatprep.cli.commands import slatprep
 from slatprep.errors import ConfigError, StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import AlignParameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.join import concat_stores, subset_store
 from slatprep.store import open_store
 
 
 @pytest.fixture(scope="module")
-def parts(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Return a dataset of five rows, built with Pixie's ranges: whole, and in two parts."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return where stores of two parts of a dataset and of the whole lie, with Pixie's ranges."""
     folder = tmp_path_factory.mktemp("parts")
-    whole = Dataset(folder / "whole")
-    named = {"a": 0, "b": 1, "c": 2, "d": 3}
-    for object_id, seed in named.items():
-        whole.add(object_id, seed, views=("front", "side") if object_id == "b" else ("",))
-    build_store(whole.parameters("pixie"), folder / "whole.zarr")
-    for part in ("ac", "bd"):
-        some = Dataset(folder / part)
-        for object_id in part:
-            some.add(
-                object_id, named[object_id], views=("front", "side") if object_id == "b" else ("",)
-            )
-        build_store(some.parameters("pixie"), folder / f"{part}.zarr")
-    return whole, folder
+    for name in ("ac", "bd", "abcd"):
+        dataset = Dataset(folder / name)
+        for object_id in name:
+            views = ("front", "side") if object_id == "b" else ("",)
+            dataset.add(object_id, "abcd".index(object_id), views=views)
+        build_store(dataset.parameters("pixie"), folder / f"{name}.zarr")
+    return folder
 
 
-def test_a_subset_is_the_build_of_its_assets(parts, tmp_path):
-    _, folder = parts
-    summary = subset_store(folder / "whole.zarr", tmp_path / "s.zarr", ["d", "b.s", "b.front"])
+def test_a_subset_is_the_build_of_its_assets(folder, tmp_path):
+    summary = subset_store(folder / "abcd.zarr", tmp_path / "s.zarr", ["d", "b.s", "b.front"])
     assert summary.statuses == {"ok": 3, "failed": 0, "skipped": 0}
     assert tree(tmp_path / "s.zarr") == tree(folder / "bd.zarr")
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
@@ -48,16 +41,14 @@ def test_a_subset_is_the_build_of_its_assets(parts, tmp_path):
     assert records_of(tmp_path / "s.manifests" / "assets.jsonl") == built
 
 
-def test_joined_stores_are_the_build_of_all_their_assets(parts, tmp_path):
-    _, folder = parts
+def test_joined_stores_are_the_build_of_all_their_assets(folder, tmp_path):
     concat_stores([folder / "bd.zarr", folder / "ac.zarr"], tmp_path / "all.zarr")
-    assert tree(tmp_path / "all.zarr") == tree(folder / "whole.zarr")
+    assert tree(tmp_path / "all.zarr") == tree(folder / "abcd.zarr")
     assert verify_store(tmp_path / "all.zarr").ok
 
 
 def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path):
     whole = make_dataset("a", "b")
-    build_store(whole.parameters(), tmp_path / "whole.zarr")
     for number, object_id in enumerate("ab"):
         part = Dataset(tmp_path / object_id)
         asset = replace(whole.assets[object_id])
@@ -82,19 +73,17 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6)
 
 
-def test_what_does_not_go_together_is_refused(parts, make_dataset, tmp_path):
-    _, folder = parts
+def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):
     out = tmp_path / "out.zarr"
     with pytest.raises(ConfigError, match=r"2 ids are in more than one store, such as a, c"):
-        concat_stores([folder / "whole.zarr", folder / "ac.zarr"], out)
+        concat_stores([folder / "abcd.zarr", folder / "ac.zarr"], out)
     with pytest.raises(ConfigError, match="expected two or more"):
         concat_stores([folder / "ac.zarr"], out)
     other = make_dataset("x")
     build_store(other.parameters(), tmp_path / "x.zarr")
     with pytest.raises(ConfigError, match="not those of the others"):
         concat_stores([folder / "ac.zarr", tmp_path / "x.zarr"], out)
-    rigid = replace(other.parameters("pixie"), align=AlignParameters(model="rigid"))
-    build_store(rigid, tmp_path / "rigid.zarr")
+    build_store(other.parameters("pixie", align={"model": "rigid"}), tmp_path / "rigid.zarr")
     with pytest.raises(ConfigError, match=r"rigid\.zarr was built with \[align\]"):
         concat_stores([folder / "ac.zarr", tmp_path / "rigid.zarr"], out)
     with pytest.raises(StoreError, match="has no asset 'z'"):
@@ -107,31 +96,20 @@ def test_what_does_not_go_together_is_refused(parts, make_dataset, tmp_path):
 
 
 def test_commands_choose_and_join(mixed_build, tmp_path):
-    store = tmp_path / "mixed.zarr"
-    shutil.copytree(str(mixed_build.store), store)  # without the records beside it
-    parts = []
-    for name, options in (
-        ("one", ["--asset", "an"]),
-        ("two", ["--asset", "bear.s", "--asset", "d"]),
-    ):
-        parts.append(str(tmp_path / f"{name}.zarr"))
-        made = CliRunner().invoke(slatprep, ["subset", str(store), "--out", parts[-1], *options])
-        assert made.exit_code == 0, made.output
-    both = tmp_path / "both.zarr"
-    made = CliRunner().invoke(slatprep, ["concat", *parts, "--out", str(both), "--json"])
-    assert made.exit_code == 0, made.output
+    store, both, good = (tmp_path / f"{name}.zarr" for name in ("mixed", "both", "good"))
+    shutil.copytree(mixed_build.store, store)  # without the records beside it
+    one, two = tmp_path / "one.zarr", tmp_path / "two.zarr"
+    run("subset", store, "--out", one, "--asset", "an")
+    run("subset", store, "--out", two, "--asset", "bear.s", "--asset", "d")
+    run("concat", one, two, "--out", both, "--json")
     assert open_store(both).ids == ["ant", "bear.side", "dog"]
     assert verify_store(both).ok
-    good = CliRunner().invoke(
-        slatprep, ["subset", str(store), "--verdict", "good", "--out", str(tmp_path / "all.zarr")]
-    )
-    assert good.exit_code == 0, good.output
-    assert len(open_store(tmp_path / "all.zarr")) == 5
-    assert CliRunner().invoke(slatprep, ["subset", str(store), "--out", "x.zarr"]).exit_code == 2
+    run("subset", store, "--verdict", "good", "--out", good)
+    assert len(open_store(good)) == 5
+    run("subset", store, "--out", "x.zarr", code=2)
 
 
-def test_a_source_is_never_replaced_whatever_path_leads_there(parts, tmp_path, monkeypatch):
-    _, folder = parts
+def test_a_source_is_never_replaced_whatever_path_leads_there(folder, tmp_path, monkeypatch):
     shutil.copytree(folder / "ac.zarr", tmp_path / "own.zarr")
     before = tree(tmp_path / "own.zarr")
     (tmp_path / "link.zarr").symlink_to("own.zarr")
@@ -150,27 +128,25 @@ def test_a_source_is_never_replaced_whatever_path_leads_there(parts, tmp_path, m
     assert tree(tmp_path / "own.zarr") == before
 
 
-def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(parts, tmp_path):
-    _, folder = parts
-    for name, change in (
-        ("none", lambda file: file.unlink()),
-        ("broken", lambda file: file.write_text("[" * 100_000)),
-        ("stale", lambda file: shutil.copy(folder / "bd.manifests" / "build.json", file)),
-    ):
-        shutil.copytree(folder / "ac.zarr", tmp_path / f"{name}.zarr")
-        shutil.copytree(folder / "ac.manifests", tmp_path / f"{name}.manifests")
-        change(tmp_path / f"{name}.manifests" / "build.json")
-        summary = subset_store(tmp_path / f"{name}.zarr", tmp_path / f"{name}-a.zarr", ["a"])
-        told = json.loads((summary.records.parent / "build.json").read_text())  # type: ignore[union-attr]
-        assert told["parameters"]["pixieverse"]["root"] == "unknown"
+@pytest.mark.parametrize("how", ["none", "broken", "stale"])
+def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(folder, tmp_path, how):
+    shutil.copytree(folder / "ac.zarr", tmp_path / "s.zarr")
+    shutil.copytree(folder / "ac.manifests", tmp_path / "s.manifests")
+    file = tmp_path / "s.manifests" / "build.json"
+    if how == "none":
+        file.unlink()
+    elif how == "broken":
+        file.write_text("[" * 100_000)
+    else:
+        shutil.copy(folder / "bd.manifests" / "build.json", file)
+    summary = subset_store(tmp_path / "s.zarr", tmp_path / "a.zarr", ["a"])
+    told = json.loads((summary.records.parent / "build.json").read_text())
+    assert told["parameters"]["pixieverse"]["root"] == "unknown"
 
 
-def test_a_store_whose_attributes_do_not_say_how_it_was_built_is_refused(parts, tmp_path):
-    _, folder = parts
-    shutil.copytree(folder / "ac.zarr", tmp_path / "odd.zarr")
-    file = tmp_path / "odd.zarr" / "zarr.json"
-    document = json.loads(file.read_text())
-    document["attributes"]["build"]["parameters"]["align"]["unheard_of"] = 1
-    file.write_text(json.dumps(document))
+def test_a_store_whose_attributes_do_not_say_how_it_was_built_is_refused(copy, tmp_path):
+    build = json.loads((copy / "zarr.json").read_text())["attributes"]["build"]
+    build["parameters"]["align"]["unheard_of"] = 1
+    edit_attributes(copy, build=build)
     with pytest.raises(StoreError, match="does not say how it was built"):
-        subset_store(tmp_path / "odd.zarr", tmp_path / "out.zarr", ["a"])
+        subset_store(copy, tmp_path / "out.zarr", ["ant"])

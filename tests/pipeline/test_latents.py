@@ -1,12 +1,13 @@
 """Latents of any width and encoder, standardised already or not, all the way to a prediction."""
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.synthetic import Dataset
+from support.made_store import edit_attributes
+from support.synthetic import Dataset, MakeDataset
 
 from slatprep import build_store, concat_stores, export_store, open_store
 from slatprep.errors import InputError, StoreError
@@ -23,20 +24,14 @@ MEAN, STD = np.array(FEATS_MEAN, np.float32), np.array(FEATS_STD, np.float32)
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
-    made = Dataset(tmp_path / "sources").having(*"abcdef")
-    return made
+def dataset(make_dataset: MakeDataset) -> Dataset:
+    return make_dataset(*"abcdef")
 
 
-def rewrite(dataset: Dataset, change) -> None:
+def rewrite(dataset: Dataset, change: Callable[[np.ndarray], np.ndarray]) -> None:
     for name, asset in dataset.assets.items():
         asset.feats = change(asset.feats)
         dataset.write_slat(f"{name}.npz", asset.coords, asset.feats)
-
-
-def of(dataset: Dataset, **slat: object) -> BuildParameters:
-    parameters = dataset.parameters()
-    return replace(parameters, slat=replace(parameters.slat, **slat))
 
 
 def of_latents(warnings: tuple[str, ...]) -> list[str]:
@@ -44,11 +39,9 @@ def of_latents(warnings: tuple[str, ...]) -> list[str]:
     return [text for text in warnings if "latents" in text]
 
 
-def test_a_store_says_which_encoder_made_its_latents(dataset, tmp_path):
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    assert of_latents(summary.warnings) == []
-    held = open_store(tmp_path / "s.zarr").attributes["latents"]
-    assert held == {
+def test_a_store_says_which_encoder_made_its_latents(mixed_build):
+    assert of_latents(mixed_build.warnings) == []
+    assert open_store(mixed_build.store).attributes["latents"] == {
         "encoder": "trellis",
         "channels": 8,
         "resolution": 64,
@@ -62,7 +55,7 @@ def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tm
     raw = {name: asset.feats.copy() for name, asset in dataset.assets.items()}
     rewrite(dataset, lambda feats: (feats - MEAN) / STD)
     out = tmp_path / "s.zarr"
-    summary = build_store(of(dataset), out)
+    summary = build_store(dataset.parameters(), out)
     warnings = of_latents(summary.warnings)
     assert len(warnings) == 1
     assert "look standardised already" in warnings[0]
@@ -80,16 +73,21 @@ def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tm
         np.testing.assert_allclose(file["feats"], raw["a"], atol=1e-5)
 
     # Said outright, nobody warns; said wrongly, it is done as said.
-    assert of_latents(build_store(of(dataset, standardised="yes"), out).warnings) == []
+    assert (
+        of_latents(build_store(dataset.parameters(slat={"standardised": "yes"}), out).warnings)
+        == []
+    )
     assert open_store(out).contents.latents.standardised
-    assert of_latents(build_store(of(dataset, standardised="no"), out).warnings) == []
+    assert (
+        of_latents(build_store(dataset.parameters(slat={"standardised": "no"}), out).warnings) == []
+    )
     assert not open_store(out).contents.latents.standardised
 
 
 def test_one_asset_unlike_the_others_is_named(dataset, tmp_path):
     asset = dataset.assets["c"]
     dataset.write_slat("c.npz", asset.coords, (asset.feats - MEAN) / STD)
-    summary = build_store(of(dataset), tmp_path / "s.zarr")
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     warnings = of_latents(summary.warnings)
     assert len(warnings) == 1
     assert "1 of 6 assets look standardised already, unlike the others (c)" in warnings[0]
@@ -103,7 +101,7 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
     description = tmp_path / "mine.json"
     description.write_text(json.dumps({"encoder": "mine", "channels": 20, "resolution": 64}))
     out = tmp_path / "s.zarr"
-    parameters = of(dataset, encoder=str(description))
+    parameters = dataset.parameters(slat={"encoder": str(description)})
     build_store(parameters, out)
     store = open_store(out)
     every = np.concatenate([asset.feats for asset in dataset.assets.values()])
@@ -128,7 +126,7 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
     other = Dataset(tmp_path / "others")
     other.add("x", 3)
     rewrite(other, lambda feats: np.tile(feats, 4)[:, :20])
-    build_store(of(other, encoder=str(description)), tmp_path / "o.zarr")
+    build_store(other.parameters(slat={"encoder": str(description)}), tmp_path / "o.zarr")
     concat_stores([out, tmp_path / "o.zarr"], tmp_path / "both.zarr")
     both = np.concatenate([every, other.assets["x"].feats])
     joined = open_store(tmp_path / "both.zarr").contents.latents
@@ -146,17 +144,11 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
         ("property_units", ["Pa"], "a unit for each"),
     ],
 )
-def test_attributes_that_do_not_fit_the_arrays_are_refused(
-    dataset, tmp_path, attribute, value, said
-):
-    out = tmp_path / "s.zarr"
-    build_store(dataset.parameters(), out)
-    document = json.loads((out / "zarr.json").read_text())
-    document["attributes"][attribute] = value
-    (out / "zarr.json").write_text(json.dumps(document))
+def test_attributes_that_do_not_fit_the_arrays_are_refused(copy, attribute, value, said):
+    edit_attributes(copy, **{attribute: value})
     with pytest.raises(StoreError, match=said):
-        open_store(out)
-    assert any(said in str(finding) for finding in metadata_findings(out))
+        open_store(copy)
+    assert any(said in str(finding) for finding in metadata_findings(copy))
 
 
 def write_both(dataset: Dataset, seed: int = 0) -> dict[str, np.ndarray]:
@@ -181,7 +173,8 @@ def write_both(dataset: Dataset, seed: int = 0) -> dict[str, np.ndarray]:
 
 def of_both(dataset: Dataset) -> BuildParameters:
     root = dataset.root / "trellis2"
-    return of(dataset, root=root, encoder="trellis2-shape-pbr", standardised="no")
+    slat = {"root": root, "encoder": "trellis2-shape-pbr", "standardised": "no"}
+    return dataset.parameters(slat=slat)
 
 
 def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
@@ -199,24 +192,15 @@ def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
     paths = {(file["role"], file["path"]) for file in files[0]}
     assert ("texture", "pbr_latents/tex_enc_1024/a.npz") in paths
     assert verify_store(out, sources=True).ok
-    write_both(dataset, seed=1)
-    changed = build_store(of_both(dataset), out)
-    build_store(of_both(dataset), tmp_path / "fresh.zarr")
-    np.testing.assert_array_equal(
-        open_store(out).read(0)["feats"], open_store(tmp_path / "fresh.zarr").read(0)["feats"]
-    )
-    assert changed.statuses["ok"] == 6
-
-
-def test_changed_texture_alone_is_noticed(dataset, tmp_path):
-    write_both(dataset)
-    build_store(of_both(dataset), tmp_path / "s.zarr")
+    # Texture that changes alone is noticed.
     path = dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz"
     with np.load(path) as held:
         np.savez(path, coords=held["coords"], feats=held["feats"] + 1)
-    assert not verify_store(tmp_path / "s.zarr", sources=True).ok
-    build_store(of_both(dataset), tmp_path / "s.zarr")
-    assert verify_store(tmp_path / "s.zarr", sources=True).ok
+    assert not verify_store(out, sources=True).ok
+    assert build_store(of_both(dataset), out).statuses["ok"] == 6
+    assert verify_store(out, sources=True).ok
+    both["a"][:, 32:] += 1
+    np.testing.assert_array_equal(open_store(out).asset("a").feats, both["a"])
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """What an update writes: files of what changed, and the lines of their records."""
 
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -21,8 +20,7 @@ pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
     """Three assets and one without a partner, and the file of their records."""
     dataset = make_dataset("a", "c", "e")
-    dataset.add("lone", seed=4)
-    (dataset.root / "slat" / "lone.npz").unlink()
+    dataset.write_grid("lone", make_asset(4).grid)
     build_store(dataset.parameters(), tmp_path / "s.zarr")
     return dataset, tmp_path / "s.manifests" / "assets.jsonl"
 
@@ -113,9 +111,7 @@ def test_lines_are_those_of_shards_and_stay_where_their_shard_does(make_dataset,
     assert lines()["assets-00002.jsonl"] == ["g", "d"]
     same = [name for name, ino in before.items() if (folder / name).stat().st_ino == ino]
     assert same == ["assets-00000.jsonl"]
-    for name in "abcdefg"[2:]:
-        shutil.rmtree(dataset.root / "pixieverse" / name, ignore_errors=True)
-        (dataset.root / "slat" / f"{name}.npz").unlink(missing_ok=True)
+    dataset.remove(*"cdefg")
     build_store(dataset.parameters(), out)
     assert lines() == {"assets.jsonl": ["a", "b"]}
     assert verify_store(out).ok
@@ -157,6 +153,5 @@ def test_an_asset_that_cannot_go_in_costs_build_json_alone(built, aligned):
     assert again.statuses == {"ok": 3, "failed": 0, "skipped": 2}
     assert "alone" in dict(again.problems) and aligned == []
     assert inodes(out) == before and lines.stat().st_ino == inode
-    for name in ("alone", "lone"):
-        shutil.rmtree(dataset.root / "pixieverse" / name)
+    dataset.remove("alone", "lone")
     assert update(dataset, lines) == ["a", "c", "e"]

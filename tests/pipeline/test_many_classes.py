@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial import cKDTree
+from support.commands import run
 from support.synthetic import SMALL_SHARDS, make_asset
 
-from slatprep import build_store, open_store, store_statistics
-from slatprep.cli.commands import slatprep as command
-from slatprep.errors import ConfigError, InputError
+from slatprep import build_store, export_store, open_store, store_statistics
+from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.inspect.report.thumbnails import SHADES, thumbnail
@@ -94,8 +93,8 @@ def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
     assert named < 20 and b"<!-- and %d more -->" % (np.count_nonzero(counts) - named) in picture
 
 
-def test_nine_classes_go_all_the_way_to_scores(tmp_path):
-    out, run = tmp_path / "s.zarr", tmp_path / "run"
+def test_nine_classes_and_other_properties_go_all_the_way_to_scores(tmp_path):
+    out, trained = tmp_path / "s.zarr", tmp_path / "run"
     parameters = write(tmp_path, "abcdefgh", 9)
     passes = replace(
         parameters,
@@ -107,6 +106,10 @@ def test_nine_classes_go_all_the_way_to_scores(tmp_path):
     store = open_store(out)
     assert store.contents.background == 254
     assert not verify_store(out).findings
+    for form in ("npz", "hdf5", "webdataset"):
+        assert export_store(out, tmp_path / form, form).assets == 8
+    with pytest.raises(StoreError, match="has no youngs_modulus and no poissons_ratio, only dens"):
+        export_store(out, tmp_path / "ply", "ply")
     # By the vote, most voxels away from the slabs' borders have the class of their place.
     for seed, asset in enumerate(store):
         voxels = np.argwhere(make_asset(seed).grid[..., 3] != 7)
@@ -116,17 +119,18 @@ def test_nine_classes_go_all_the_way_to_scores(tmp_path):
         # In the thumbnail no class has the colour of another.
         shown = {(index - 1) // SHADES for index in np.unique(thumbnail(asset)) if index}
         assert shown <= set(asset.material.tolist()) and shown & {7, 8}
-    train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
-    assert np.isfinite(
-        evaluate_store(run / "predictions", out, split=None).overall.means["accuracy"]
-    )
-    with np.load(next((run / "predictions").glob("*.npz"))) as file:
+    train(out, trained, TrainParameters(size="small", epochs=1, precision="fp32"))
+    means = evaluate_store(trained / "predictions", out, split=None).overall.means
+    assert tuple(means) == ("log10 density", "hardness", "mean", "accuracy")
+    assert np.isfinite(means["accuracy"])
+    with np.load(next((trained / "predictions").glob("*.npz"))) as file:
+        assert file["properties_si"].shape[1] == 2
+        assert file["columns"].tolist() == ["density", "hardness"]
         assert file["probabilities"].shape[1] == 9
         np.testing.assert_array_equal(file["material"], file["probabilities"].argmax(axis=1))
-    picture = ("--store", out, "--asset", "a", "--picture", tmp_path / "a.png")
-    for words in (("check-alignment", *picture), ("report", out), ("info", out), ("describe", out)):
-        result = CliRunner().invoke(command, list(map(str, words)))
-        assert result.exit_code == 0, result.output
+    run("check-alignment", "--store", out, "--asset", "a", "--picture", tmp_path / "a.png")
+    for name in ("report", "info", "describe", "stats"):
+        run(name, out)
 
 
 def test_scores_of_many_classes_are_read(tmp_path):

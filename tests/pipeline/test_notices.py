@@ -1,16 +1,20 @@
-"""What a build tells once of a dataset as a whole."""
+"""What a build tells of a dataset as a whole, and of itself at the end."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.synthetic import Dataset
+from support.synthetic import Dataset, MakeDataset
 
 from slatprep.errors import ConfigError
 from slatprep.normalize import ranges_from_extents
+from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
-from slatprep.pipeline.summary import wild_ranges
+from slatprep.pipeline.recipe import recipe_of, record_of_failed
+from slatprep.pipeline.rows import Row
+from slatprep.pipeline.summary import counts_of, nothing_usable, summarise, wild_ranges
+from slatprep.records import AssetPair, Failed, SourceRoots, Status
+from slatprep.store.record import FailedRecord
 
 USUAL = ((3.2, 10.8), (1.8, 3.8), (0.21, 0.45))
 
@@ -35,9 +39,8 @@ def test_ranges_that_pixie_publishes_are_no_surprise():
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
-    made = Dataset(tmp_path / "data").having(*"abcdef")
-    return made
+def dataset(make_dataset: MakeDataset) -> Dataset:
+    return make_dataset(*"abcdef")
 
 
 def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
@@ -49,34 +52,64 @@ def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
 
 
 def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
-    parameters = dataset.parameters()
-    warn = replace(parameters.pixieverse, plausibility="warn")
-    for name in ("a", "b"):
-        file = dataset.root / "pixieverse" / name / "sample_0/material_grid.npy"
-        grid = np.load(file)
+    warn = dataset.parameters(pixieverse={"plausibility": "warn"})
+    for name in "ab":
+        grid = dataset.assets[name].grid
         grid[..., 1] /= 1e9
-        np.save(file, grid)
-    summary = build_store(parameters, tmp_path / "refused.zarr")
-    assert sorted(name for name, why in summary.problems if "the values look like" in why) == [
-        "a",
-        "b",
-    ]
-    summary = build_store(replace(parameters, pixieverse=warn), tmp_path / "s.zarr")
+        dataset.write_grid(name, grid)
+    summary = build_store(dataset.parameters(), tmp_path / "refused.zarr")
+    refused = [name for name, why in summary.problems if "the values look like" in why]
+    assert sorted(refused) == ["a", "b"]
+    summary = build_store(warn, tmp_path / "s.zarr")
     (text,) = [text for text in summary.warnings if "unusual" in text]
     assert text.startswith("values of 2 of 6 assets are unusual (a, b): the values look like")
-    lines = Path(str(summary.records)).read_text().splitlines()
-    assert sum("plausibility: " in line for line in lines) == 2
+    assert sum("plausibility: " in line for line in summary.records.open()) == 2
 
 
-def test_one_asset_alone_does_not_tell_whether_it_is_standardised(tmp_path):
-    dataset = Dataset(tmp_path / "data")
-    dataset.add("a", 0)
-    asset = dataset.assets["a"]
-    rng = np.random.default_rng(0)
-    narrow = rng.normal(size=asset.feats.shape) * 0.4  # standardised, of one asset
-    dataset.write_slat("a.npz", asset.coords, narrow.astype(np.float32))
-    parameters = dataset.parameters()
+def test_one_asset_alone_does_not_tell_whether_it_is_standardised(make_dataset, tmp_path):
+    dataset = make_dataset("a")
+    coords = dataset.assets["a"].coords
+    narrow = np.random.default_rng(0).normal(size=(len(coords), 8)) * 0.4  # as of one asset
+    dataset.write_slat("a.npz", coords, narrow.astype(np.float32))
     with pytest.raises(ConfigError, match="one asset alone does not tell"):
-        build_store(parameters, tmp_path / "s.zarr")
-    said = replace(parameters, slat=replace(parameters.slat, standardised="yes"))
+        build_store(dataset.parameters(), tmp_path / "s.zarr")
+    said = dataset.parameters(slat={"standardised": "yes"})
     assert build_store(said, tmp_path / "s.zarr").statuses["ok"] == 1
+
+
+PARAMETERS = BuildParameters(PixieverseSource(Path("/grids")), SlatSource(Path("/slats")))
+
+
+def failed(number: int, status: Status = Status.FAILED) -> FailedRecord:
+    pair = AssetPair(f"a{number:03d}", "", "", "", SourceRoots(Path(), Path()), *[None] * 4)
+    return record_of_failed(Failed(pair, status, f"reason {number}"), recipe_of(PARAMETERS))
+
+
+def finished(name: str, verdict: str) -> Row:
+    columns = {"verdict": verdict, "unphysical": 4, "contradicted": name == "y", "n_valid": 7}
+    return Row(name, 10, columns=columns)
+
+
+def test_assets_are_counted_and_the_first_hundred_problems_listed():
+    usable = [finished("x", "good"), finished("y", "doubtful"), finished("z", "good")]
+    without = [*map(failed, range(120)), failed(120, Status.SKIPPED)]
+    summary = summarise(counts_of(usable), without, Path("r"), "id", 1.0)
+    assert summary.statuses == {"ok": 3, "failed": 120, "skipped": 1}
+    assert summary.verdicts == {"doubtful": 1, "good": 2}
+    assert (summary.n_voxels, summary.n_valid) == (30, 21)
+    assert summary.n_unphysical == 12
+    assert summary.contradicted == ("y",)
+    assert summary.problems[0] == ("a000", "reason 0")
+    assert len(summary.problems) == 100
+    assert not summary.complete
+    clean = summarise(counts_of(usable[-1:]), [], Path("r"), "id", 1.0)
+    assert clean.complete
+
+
+def test_nothing_usable_names_five_and_counts_the_rest():
+    five = nothing_usable([failed(n) for n in range(5)], PARAMETERS)
+    assert "none of 5 assets can be used" in five
+    assert five.splitlines()[1:] == [f"  a00{n}: reason {n}" for n in range(5)]
+    seven = nothing_usable([failed(n) for n in range(7)], PARAMETERS)
+    assert seven.splitlines()[-1] == "  and 2 more"
+    assert "no asset found in /grids and /slats" in nothing_usable([], PARAMETERS)

@@ -5,7 +5,6 @@ import json
 import shutil
 import tarfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,19 +26,15 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-@pytest.mark.parametrize("root", ["tar", "tar/archives", "gz/archives/render_outputs"])
+@pytest.mark.parametrize(
+    "root", ["pixieverse", "tar", "tar/archives", "gz/archives/render_outputs"]
+)
 def test_store_of_archives_is_that_of_the_unpacked_folder(made, tmp_path, unpacked, root):
-    summary = build_store(parameters(made, root), tmp_path / "s.zarr")
+    chosen = parameters(made, root, categories=root == "pixieverse")
+    summary = build_store(chosen, tmp_path / "s.zarr")
     assert summary.statuses == {"ok": 4, "failed": 0, "skipped": 1}
     assert files(tmp_path / "s.zarr") == unpacked
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
-
-
-def test_unpacked_root_is_read_where_its_grids_lie(made, tmp_path, unpacked):
-    for other in ("data", "outputs"):
-        (made / "pixieverse" / other / IDS[0]).mkdir(parents=True, exist_ok=True)
-    build_store(parameters(made, "pixieverse", categories=True), tmp_path / "s.zarr")
-    assert files(tmp_path / "s.zarr") == unpacked
 
 
 @pytest.mark.parametrize("root", ["tar", "gz"])
@@ -71,14 +66,14 @@ class Reads:
 
 
 def test_headers_and_needed_members_alone_are_read_and_an_index_but_once(
-    made, tmp_path, monkeypatch, files_are_old
+    objects, made, tmp_path, monkeypatch, files_are_old
 ):
     reads = Reads(monkeypatch)
     build_store(parameters(made, "tar"), tmp_path / "s.zarr")
     needed = sum(
         path.stat().st_size
         for name in IDS[:4]
-        for path in (made / "pixieverse" / "render_outputs" / name).rglob("*")
+        for path in (objects / name).rglob("*")
         if path.name in ("material_grid.npy", "clip_features_mask.npy", "clip_features.npz")
     )
     whole = sum(path.stat().st_size for path in (made / "tar").rglob("*.tar"))
@@ -128,15 +123,11 @@ def test_stopped_reading_of_an_archive_with_gzip_begins_again_and_is_told(made):
     assert passed == sorted(passed) and passed[-1] == path.stat().st_size
 
 
-def test_what_changed_in_an_archive_is_built_again_alone(made, tmp_path):
+def test_what_changed_in_an_archive_is_built_again_alone(objects, made, tmp_path):
     folder = shutil.copytree(made / "tar", tmp_path / "tar")
     build_store(parameters(made, folder), tmp_path / "s.zarr")
-    shutil.copytree(made / "pixieverse" / "render_outputs" / IDS[0], tmp_path / "new" / IDS[0])
-    shutil.copytree(made / "pixieverse" / "render_outputs" / IDS[3], tmp_path / "new" / IDS[3])
-    write_grid = tmp_path / "new" / IDS[3] / "sample_0" / "material_grid.npy"
-    shutil.rmtree(tmp_path / "new" / IDS[3])
+    shutil.copytree(objects / IDS[0], tmp_path / "new" / IDS[0])
     write_object(tmp_path / "new" / IDS[3], make_asset(3).grid * [1, 2, 1, 1], 3)
-    assert write_grid.exists()
     pack(folder / "archives/render_outputs/tree.tar", sorted((tmp_path / "new").iterdir()))
     build_store(parameters(made, folder), tmp_path / "s.zarr")
     build_store(parameters(made, folder), tmp_path / "fresh.zarr")
@@ -146,22 +137,23 @@ def test_what_changed_in_an_archive_is_built_again_alone(made, tmp_path):
 
 
 @pytest.fixture
-def strange(made: Path, tmp_path: Path) -> Iterator[Path]:
-    """Return a folder with one archive that tests write."""
-    folder = tmp_path / "strange"
-    folder.mkdir()
-    yield folder
+def strange(tmp_path: Path) -> Path:
+    """Return a folder for archives that tests write."""
+    (tmp_path / "strange").mkdir()
+    return tmp_path / "strange"
 
 
-def grid_of(made: Path, number: int) -> Path:
-    return made / "pixieverse" / "render_outputs" / IDS[number] / "sample_0" / "material_grid.npy"
+def grid_of(objects: Path, number: int) -> Path:
+    return objects / IDS[number] / "sample_0" / "material_grid.npy"
 
 
-def test_last_of_two_members_counts_and_links_lead_within_the_archive(made, strange, tmp_path):
+def test_last_of_two_members_counts_and_links_lead_within_the_archive(
+    objects, made, strange, tmp_path
+):
     name = f"{IDS[0]}/sample_0/material_grid.npy"
     with tarfile.open(strange / "tree.tar", "w") as archive:
-        archive.add(grid_of(made, 1), arcname=f"./{name}")
-        archive.add(grid_of(made, 0), arcname=name)
+        archive.add(grid_of(objects, 1), arcname=f"./{name}")
+        archive.add(grid_of(objects, 0), arcname=name)
         link = tarfile.TarInfo(f"{IDS[1]}/sample_0/material_grid.npy")
         link.type, link.linkname = tarfile.LNKTYPE, name
         archive.addfile(link)
@@ -177,7 +169,7 @@ def test_last_of_two_members_counts_and_links_lead_within_the_archive(made, stra
     summary = build_store(parameters(made, strange), tmp_path / "s.zarr", note=told.append)
     problems = dict(summary.problems)
     records = [json.loads(line) for line in (tmp_path / "s.manifests" / "assets.jsonl").open()]
-    digest = hashlib.sha256(grid_of(made, 0).read_bytes()).hexdigest()
+    digest = hashlib.sha256(grid_of(objects, 0).read_bytes()).hexdigest()
     grids = {r["asset_id"]: r["sources"][0]["sha256"] for r in records if r["status"] == "ok"}
     assert grids == {IDS[0]: digest, IDS[1]: digest}
     (line,) = [line for line in told if "twice" in line]
@@ -186,8 +178,7 @@ def test_last_of_two_members_counts_and_links_lead_within_the_archive(made, stra
     assert "is a device or a pipe" in problems[IDS[3]]
 
 
-def test_object_in_two_archives_is_not_taken_from_either(made, strange, tmp_path):
-    objects = made / "pixieverse" / "render_outputs"
+def test_object_in_two_archives_is_not_taken_from_either(objects, made, strange, tmp_path):
     pack(strange / "sand.tar", [objects / IDS[0], objects / IDS[1]])
     pack(strange / "tree.tar", [objects / IDS[0]])
     summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
@@ -204,36 +195,32 @@ def damaged(data: bytes) -> bytes:
     return data[:at] + b"x" + data[at + 1 :]
 
 
-@pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
-def test_truncated_archive_is_named_and_the_rest_of_it_built(made, strange, tmp_path, suffix):
-    objects = made / "pixieverse" / "render_outputs"
-    path = strange / f"tree{suffix}"
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("tree.tar", truncated, "download it again"),
+        ("tree.tar.gz", truncated, "download it again"),
+        ("tree.tar", damaged, "is damaged at byte"),
+    ],
+)
+def test_broken_archive_is_named_and_what_lies_before_built(
+    objects, made, strange, tmp_path, name, change, said
+):
+    path = strange / name
     pack(path, [objects / IDS[0], objects / IDS[1]])
-    path.write_bytes(truncated(path.read_bytes()))
+    path.write_bytes(change(path.read_bytes()))
     summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
-    (line,) = [text for name, text in summary.problems if name.startswith("tree")]
-    assert path.name in line and "download it again" in line
+    (line,) = [text for about, text in summary.problems if about.startswith("tree")]
+    assert said in line and (change is damaged or name in line)
     assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[0]]
 
 
-def test_damaged_header_is_named_and_what_lies_before_it_built(made, strange, tmp_path):
-    objects = made / "pixieverse" / "render_outputs"
-    path = strange / "tree.tar"
-    pack(path, [objects / IDS[0], objects / IDS[1]])
-    path.write_bytes(damaged(path.read_bytes()))
-    summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
-    (line,) = [text for name, text in summary.problems if name.startswith("tree")]
-    assert "is damaged at byte" in line
-    assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[0]]
-
-
-def test_archive_replaced_during_a_build_is_noticed(made, strange):
-    objects = made / "pixieverse" / "render_outputs"
+def test_archive_replaced_during_a_build_is_noticed(objects, strange):
     path = strange / "tree.tar"
     pack(path, [objects / IDS[0]])
     archive = archives.Archive.on_disk(path, ("*/sample_*/material_grid.npy",))
     (entry,) = [one for name, one in archive.index().members.items() if "material" in name]
-    assert archive.read(entry) == grid_of(made, 0).read_bytes()
+    assert archive.read(entry) == grid_of(objects, 0).read_bytes()
     pack(path, [objects / IDS[1]])
     with pytest.raises(InputError, match="was replaced after it was looked at"):
         archive.read(entry)
@@ -263,10 +250,11 @@ def test_long_names_are_read_in_both_forms(strange):
 
 
 @pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
-def test_member_that_no_reader_takes_is_not_read(made, strange, tmp_path, suffix, monkeypatch):
+def test_member_that_no_reader_takes_is_not_read(
+    objects, made, strange, tmp_path, suffix, monkeypatch
+):
     monkeypatch.setattr("slatprep.storage.tar.MAX_KEPT", 2**20)
     monkeypatch.setattr("slatprep.readers.files.MAX_FILE_BYTES", 2**20)
-    objects = made / "pixieverse" / "render_outputs"
     pack(strange / f"tree{suffix}", [objects / IDS[0]])
     (pair,) = [one for one in discover(parameters(made, strange)) if one.grid]
     with pytest.raises(InputError, match="is larger than 1 MiB"):

@@ -55,14 +55,13 @@ def test_one_archive_of_the_hub_and_one_with_gzip(hub, made, tmp_path):
 
 
 def test_second_look_reads_nothing_of_the_archives_and_another_commit_what_changed(
-    hub, made, tmp_path
+    objects, hub, made, tmp_path
 ):
     build_store(parameters(made, URL), tmp_path / "s.zarr")
     hub.requests.clear()
     assert build_store(parameters(made, URL), tmp_path / "s.zarr").statuses["ok"] == 4
     assert hub.ranges() == 0
     root = shutil.copytree(made / "tar", tmp_path / "next")
-    objects = made / "pixieverse" / "render_outputs"
     pack(root / "archives/render_outputs/tree.tar", [objects / IDS[0]])
     hub.publish(NAME, root)
     hub.requests.clear()
@@ -103,7 +102,7 @@ def test_bytes_are_told_and_what_was_fetched_is_kept_when_a_build_stops(
     assert not any(line.startswith("archives") for line in lines)
 
 
-def test_neighbours_come_with_one_request(hub, made, tmp_path):
+def test_neighbours_come_with_one_request(objects, hub, made, tmp_path):
     pairs = [pair for pair in discover(parameters(made, URL)) if not pair.problem]
     hub.requests.clear()
     fetch_members(pairs, None)
@@ -112,7 +111,7 @@ def test_neighbours_come_with_one_request(hub, made, tmp_path):
     for pair in pairs:
         for place in (pair.grid, pair.mask, pair.bounds):
             assert place is not None
-            own = made / "pixieverse" / "render_outputs" / str(place).partition(".tar/")[2]
+            own = objects / str(place).partition(".tar/")[2]
             assert place.read_bytes() == own.read_bytes()
     assert hub.ranges() == 0
 
@@ -148,20 +147,19 @@ def test_connection_that_ends_in_the_middle_is_made_again(hub, made, tmp_path, u
     assert files(tmp_path / "s.zarr") == unpacked
 
 
-def test_build_stays_with_the_commit_that_it_began_with(hub, made):
+def test_build_stays_with_the_commit_that_it_began_with(objects, hub, made):
     pairs = discover(parameters(made, URL))
     hub.publish(NAME, made / "gz")
     grid = pairs[0].grid
     assert grid is not None
-    own = made / "pixieverse" / "render_outputs" / IDS[0] / "sample_0" / "material_grid.npy"
+    own = objects / IDS[0] / "sample_0" / "material_grid.npy"
     assert grid.read_bytes() == own.read_bytes()
 
 
-def test_archive_that_changes_within_a_commit_is_named(hub, made, tmp_path):
+def test_archive_that_changes_within_a_commit_is_named(objects, hub, made, tmp_path):
     root = shutil.copytree(made / "tar", tmp_path / "own")
     hub.publish(NAME, root)
     pairs = discover(parameters(made, URL))
-    objects = made / "pixieverse" / "render_outputs"
     pack(root / "archives/render_outputs/tree.tar", [objects / IDS[1], objects / IDS[2]])
     assert pairs[0].grid is not None
     with pytest.raises(InputError, match=r"tree\.tar: was replaced after it was looked at"):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.faults import inject
 from support.synthetic import Dataset
 from support.trees import tree
 
@@ -119,24 +118,17 @@ def test_a_single_value_gets_a_width(make_dataset, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [('{"train": ["a"]', "cannot be read"), ('{"train": ["nobody"]}', "none of the dataset's")],
+    ("text", "error", "message"),
+    [
+        ('{"train": ["a"]', InputError, "cannot be read"),
+        ('{"train": ["nobody"]}', InputError, "none of the dataset's"),
+        ('{"test": ["a"], "val": ["b"]}', ConfigError, "no object is trained on"),
+    ],
 )
-def test_lists_that_cannot_be_used_are_named(make_dataset, tmp_path, monkeypatch, text, message):
-    def fail_at_assets(step: str, name: str) -> None:
-        assert step.startswith("work folder"), f"{step} {name}"
-
-    inject(monkeypatch, fail_at_assets)
-    dataset, out = make_dataset("a"), tmp_path / "s.zarr"
+def test_lists_that_cannot_be_used_are_named(make_dataset, tmp_path, steps, text, error, message):
+    dataset, out = make_dataset("a", "b"), tmp_path / "s.zarr"
     (tmp_path / "lists.json").write_text(text)
     chosen = of(dataset, ranges="p1-p99", objects="train", split_by=str(tmp_path / "lists.json"))
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(error, match=message):
         build_store(chosen, out)
-    assert not out.exists()
-
-
-def test_nobody_to_train_on_is_an_error(make_dataset, tmp_path):
-    (tmp_path / "lists.json").write_text('{"test": ["a"], "val": ["b"]}')
-    chosen = of(make_dataset("a", "b"), objects="train", split_by=str(tmp_path / "lists.json"))
-    with pytest.raises(ConfigError, match="no object is trained on"):
-        build_store(chosen, tmp_path / "s.zarr")
+    assert not steps and not out.exists()

@@ -1,7 +1,6 @@
 """What a source can say is never more than the readers of a store take back."""
 
 import os
-from dataclasses import replace
 
 import numpy as np
 from support.trees import tree
@@ -20,8 +19,7 @@ def test_more_annotations_than_a_record_holds_cost_their_asset_alone(make_datase
         (folder / f"sample_{sample}").mkdir()
         grid = f"sample_{sample}/material_grid.npy"
         os.link(folder / "sample_0/material_grid.npy", folder / grid)
-    parameters = dataset.parameters("pixie")
-    parameters = replace(parameters, pixieverse=replace(parameters.pixieverse, samples="merge"))
+    parameters = dataset.parameters("pixie", pixieverse={"samples": "merge"})
     summary = build_store(parameters, tmp_path / "s.zarr")
     assert (summary.statuses["ok"], summary.statuses["failed"]) == (1, 1)
     assert "256 annotations in 257 files" in dict(summary.problems)["a"]
@@ -30,12 +28,11 @@ def test_more_annotations_than_a_record_holds_cost_their_asset_alone(make_datase
 
 def test_more_warnings_than_a_record_holds_are_counted(make_dataset, tmp_path):
     dataset = make_dataset("a")
-    folder = dataset.root / "pixieverse/a"
-    grid = np.load(folder / "sample_0/material_grid.npy")
+    grid = dataset.assets["a"].grid
     grid[tuple(np.argwhere(grid[..., 3] != 7)[0])] = (np.nan, np.nan, np.nan, -1)
-    np.save(folder / "sample_0/material_grid.npy", grid)
+    dataset.write_grid("a", grid)
     nowhere = {f"bounds_{k}": np.full(3, np.nan) for k in range(256)}
-    np.savez(folder / "clip_features.npz", **nowhere)
+    np.savez(dataset.root / "pixieverse/a/clip_features.npz", **nowhere)
     out = tmp_path / "s.zarr"
     build_store(dataset.parameters("pixie"), out)
     warnings = StoredRecords(open_store(out)).of("a").warnings

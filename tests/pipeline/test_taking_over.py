@@ -146,8 +146,7 @@ def test_a_change_of_latents_alone_costs_its_own_chunks(built, steps):
 def test_what_is_removed_moves_the_rows_behind_it(built, steps):
     dataset, out = built
     before = inodes(out)
-    shutil.rmtree(dataset.root / "pixieverse" / "e")
-    (dataset.root / "slat" / "e.npz").unlink()
+    dataset.remove("e")
     steps.clear()
     build_store(dataset.parameters(), out)
     assert names(steps, "asset read") == []
@@ -157,8 +156,7 @@ def test_what_is_removed_moves_the_rows_behind_it(built, steps):
 
 def test_grids_that_move_are_not_unpacked(built, monkeypatch):
     dataset, out = built
-    shutil.rmtree(dataset.root / "pixieverse" / "a")
-    (dataset.root / "slat" / "a.npz").unlink()
+    dataset.remove("a")
     dataset.add("h", seed=1)
     read, unpacked = RowReader.read, []
 
@@ -179,8 +177,7 @@ def test_another_name_costs_a_record(built, steps, tmp_path):
     before = inodes(out)
     categories = tmp_path / "categories.json"
     categories.write_text(json.dumps({"c": {"obj_class": "tree"}}))
-    parameters = dataset.parameters()
-    named = replace(parameters, pairing=replace(parameters.pairing, categories=categories))
+    named = dataset.parameters(pairing={"categories": categories})
     steps.clear()
     build_store(named, out)
     assert names(steps, "asset read") == []
@@ -205,8 +202,7 @@ def test_any_sequence_of_updates_comes_to_the_same_when_compacted(make_dataset, 
                 there.append(name)
             if what == "remove" and len(there) > 1:
                 there.remove(name)
-                shutil.rmtree(dataset.root / "pixieverse" / name)
-                (dataset.root / "slat" / f"{name}.npz").unlink()
+                dataset.remove(name)
             else:
                 dataset.add(name, seed=rng.randrange(8))
         build_store(dataset.parameters(), out)

@@ -1,20 +1,20 @@
 """Two sources of one object, merged: each in its own form and frame, with what it knows."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.faults import inject
-from support.synthetic import Dataset, MakeDataset, make_asset
+from support.synthetic import Dataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, PixieverseSource
 from slatprep.parameters.files import load_parameters
-from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
 from slatprep.pipeline.join import subset_store
 from slatprep.records import SourceRoots
 from slatprep.store import open_store
@@ -48,10 +48,10 @@ def write_third(root: Path, name: str, seed: int) -> None:
     np.save(path, grid)
 
 
-@pytest.fixture
-def sources(make_dataset: MakeDataset) -> Dataset:
-    """Objects ``a`` and ``b``; two further sources of ``a``."""
-    dataset = make_dataset("a", "b")
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Objects ``a`` and ``b``; two further sources of ``a``; nobody may change them."""
+    dataset = Dataset(tmp_path_factory.mktemp("sources")).having("a", "b")
     for name in ("second", "third"):
         (dataset.root / name).mkdir()
     describe(dataset.root)
@@ -60,23 +60,28 @@ def sources(make_dataset: MakeDataset) -> Dataset:
     return dataset
 
 
+@pytest.fixture(scope="module")
+def made(first: Dataset, tmp_path_factory: pytest.TempPathFactory) -> BuildSummary:
+    """Build all three; nobody may change the store."""
+    return build_store(asked(first), tmp_path_factory.mktemp("made") / "s.zarr")
+
+
+@pytest.fixture
+def sources(first: Dataset, tmp_path: Path) -> Dataset:
+    """Return the dataset of a test that changes it."""
+    return Dataset(shutil.copytree(first.root, tmp_path / "sources"), first.assets)
+
+
 def asked(dataset: Dataset) -> BuildParameters:
-    parameters = dataset.parameters()
-    return replace(
-        parameters,
-        pixieverse=replace(parameters.pixieverse, samples="merge"),
-        also=(
-            PixieverseSource(dataset.root / "second", adapter="voxels"),
-            PixieverseSource(dataset.root / "third"),
-        ),
-    )
+    second = PixieverseSource(dataset.root / "second", adapter="voxels")
+    also = (second, PixieverseSource(dataset.root / "third"))
+    return replace(dataset.parameters(pixieverse={"samples": "merge"}), also=also)
 
 
-def test_each_says_what_it_knows(sources, tmp_path):
-    plain = build_store(sources.parameters(), tmp_path / "plain.zarr")
-    alone = open_store(str(plain.store)).asset("a")
-    made = build_store(asked(sources), tmp_path / "s.zarr")
-    store = open_store(str(made.store))
+def test_each_says_what_it_knows(first, made, tmp_path):
+    plain = build_store(first.parameters(), tmp_path / "plain.zarr")
+    alone = open_store(plain.store).asset("a")
+    store = open_store(made.store)
     asset = store.asset("a")
     assert asset.valid.all()
     modulus, density, ratio = asset.properties_si.T.astype(float)
@@ -98,8 +103,7 @@ def test_each_says_what_it_knows(sources, tmp_path):
     assert not store.asset("b").merged
 
 
-def test_the_record_names_each_file_and_its_source(sources, tmp_path):
-    made = build_store(asked(sources), tmp_path / "s.zarr")
+def test_the_record_names_each_file_and_its_source(made):
     record = records_of(made.records)["a"]
     files = record["sources"]
     named = {
@@ -119,42 +123,39 @@ def test_the_record_names_each_file_and_its_source(sources, tmp_path):
 
 
 def test_the_labels_are_made_again_of_the_sources(sources, tmp_path):
-    made = build_store(asked(sources), tmp_path / "s.zarr")
-    out = str(made.store)
+    out = tmp_path / "s.zarr"
+    build_store(asked(sources), out)
     assert verify_store(out, sources=True).findings == ()
     subset_store(out, tmp_path / "a.zarr", ["a"])
     assert verify_store(tmp_path / "a.zarr", sources=True).findings == ()
-    for name in ("pixieverse", "slat", "second", "third"):
-        (sources.root / name).rename(sources.root / f"{name}-now")
-    now = {name: sources.root / f"{name}-now" for name in ("pixieverse", "slat", "second", "third")}
+    now = sources.root.rename(tmp_path / "now")
     also = [
-        SourceRoots(now[name], now["slat"], number=k) for k, name in ((1, "second"), (2, "third"))
+        SourceRoots(now / name, now / "slat", number=k)
+        for k, name in enumerate(("second", "third"), 1)
     ]
-    roots = SourceRoots(now["pixieverse"], now["slat"])
-    assert verify_store(out, sources=True, roots=replace(roots, also=tuple(also))).findings == ()
+    roots = SourceRoots(now / "pixieverse", now / "slat", also=tuple(also))
+    assert verify_store(out, sources=True, roots=roots).findings == ()
     fewer = replace(roots, also=(also[0],))
     (finding,) = verify_store(out, sources=True, roots=fewer).findings
     assert "[[also]] 2, whose root is not known" in finding.what
 
 
-def test_a_change_in_a_further_source_redoes_that_object_alone(sources, tmp_path, monkeypatch):
+def test_a_change_in_a_further_source_redoes_that_object_alone(sources, tmp_path, aligned):
     write_third(sources.root, "b", 1)
     out = tmp_path / "s.zarr"
     build_store(asked(sources), out)
-    assert {str(one.action) for one in plan_build(asked(sources), out).assets} == {"reuse"}
+    assert {one.action for one in plan_build(asked(sources), out).assets} == {"reuse"}
     write_second(sources.root, "a", 0, factor=2.0)
-    done: list[str] = []
-    inject(monkeypatch, lambda step, name: done.append(name) if step == "asset aligned" else None)
+    aligned.clear()
     build_store(asked(sources), out)
-    assert set(done) == {"a"}
-    fresh = build_store(asked(sources), tmp_path / "fresh.zarr")
-    assert tree(out) == tree(fresh.store)
+    assert set(aligned) == {"a"}
+    assert tree(out) == tree(build_store(asked(sources), tmp_path / "fresh.zarr").store)
 
 
 def test_what_is_left_must_have_all_that_the_store_holds(sources, tmp_path):
     (sources.root / "pixieverse/a/sample_0/material_grid.npy").write_bytes(b"torn")
     made = build_store(asked(sources), tmp_path / "s.zarr")
-    asset = open_store(str(made.store)).asset("a")
+    asset = open_store(made.store).asset("a")
     assert set(np.unique(asset.material)) == {0, 2}  # as the third has it
     (sources.root / "third/a/sample_0/material_grid.npy").write_bytes(b"torn")
     made = build_store(asked(sources), tmp_path / "s.zarr")

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.faults import inject
+from support.first_builds import tree_from_nothing
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
-from slatprep.parameters import BuildParameters
 from slatprep.pipeline import seen
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import AssetPair, SourceRoots
@@ -30,13 +30,6 @@ def built(dataset: Dataset, folder: Path, **how: object) -> dict[str, str]:
     return tree(summary.store)
 
 
-def from_nothing(parameters: BuildParameters, folder: Path) -> dict[str, str]:
-    summary = build_store(parameters, folder / "reference" / "s.zarr")
-    hashes = tree(summary.store)
-    shutil.rmtree(folder / "reference")
-    return hashes
-
-
 def other_slat(dataset: Dataset, name: str = "a.npz") -> None:
     made = make_asset(0)
     dataset.write_slat(name, made.coords, made.feats + 1)
@@ -44,8 +37,7 @@ def other_slat(dataset: Dataset, name: str = "a.npz") -> None:
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_mapping_that_is_held_open(tmp_path, closed):
-    dataset = Dataset(tmp_path / "d")
-    dataset.add("a", seed=0)
+    dataset = Dataset(tmp_path / "d").having("a")
     path = dataset.root / "pixieverse" / "a" / "sample_0" / "material_grid.npy"
     held = np.load(path, mmap_mode="r+")
     at = tuple(np.argwhere(held[..., 3] == 0)[0])
@@ -57,7 +49,7 @@ def test_a_mapping_that_is_held_open(tmp_path, closed):
     assert path.stat().st_mtime_ns == state.st_mtime_ns
     if closed:
         del held
-    assert built(dataset, tmp_path, rehash=0) == from_nothing(dataset.parameters(), tmp_path)
+    assert built(dataset, tmp_path, rehash=0) == tree_from_nothing(dataset.parameters())
     assert tree(tmp_path / "s.zarr") != first
 
 
@@ -66,9 +58,7 @@ def test_a_mapping_that_is_held_open(tmp_path, closed):
 def test_sources_that_are_exchanged_while_they_are_read_and_put_back(
     tmp_path, monkeypatch, what, of
 ):
-    dataset, other = Dataset(tmp_path / "d"), Dataset(tmp_path / "other")
-    for one in (dataset, other):
-        one.add("a", seed=0)
+    dataset, other = (Dataset(tmp_path / name).having("a") for name in ("d", "other"))
     other_slat(other)
     place = dataset.root / "slat" if what == "folder" else dataset.root / "slat" / "a.npz"
     theirs = other.root / place.relative_to(dataset.root)
@@ -105,7 +95,7 @@ def test_sources_that_are_exchanged_while_they_are_read_and_put_back(
     with monkeypatch.context() as context:
         inject(context, fault)
         wrong = built(dataset, tmp_path, rehash=0)
-    right = from_nothing(dataset.parameters(), tmp_path)
+    right = tree_from_nothing(dataset.parameters())
     assert wrong != right
     assert built(dataset, tmp_path, rehash=0) == right
 
@@ -127,8 +117,7 @@ def mounted(image: Path, place: Path) -> Iterator[None]:
     reason="only root mounts images; tests/storage/test_states.py has what is asked of mounts",
 )
 def test_images_that_are_mounted_in_turn(tmp_path):
-    dataset = Dataset(tmp_path / "made")
-    dataset.add("a", seed=0)
+    dataset = Dataset(tmp_path / "made").having("a")
     images = [tmp_path / name for name in ("a.img", "b.img")]
     with images[0].open("wb") as file:
         file.truncate(16 << 20)
@@ -160,7 +149,7 @@ def test_images_that_are_mounted_in_turn(tmp_path):
             found = (there.root / "slat" / "a.npz").stat()
             states_seen.append((found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns))
             trees.append(built(there, tmp_path, rehash=0))
-            assert trees[-1] == from_nothing(there.parameters(), tmp_path)
+            assert trees[-1] == tree_from_nothing(there.parameters())
     assert states_seen[0] == states_seen[1]
     assert trees[0] != trees[1]
 
@@ -205,7 +194,7 @@ def test_a_share_is_hashed_at_each_build_and_finds_all(unnoticed, tmp_path):
         assert tree(tmp_path / "s.zarr") == first
     assert seed < 20  # Two of six are hashed each time.
     assert "the sources of a3 changed" in summary.warnings[0]
-    assert tree(tmp_path / "s.zarr") == from_nothing(dataset.parameters(), tmp_path)
+    assert tree(tmp_path / "s.zarr") == tree_from_nothing(dataset.parameters())
 
 
 def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
@@ -213,9 +202,7 @@ def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
 ):
     from slatprep.pipeline import plan
 
-    dataset, hashed = Dataset(tmp_path / "d"), list[str]()
-    dataset.add("a", seed=0)
-    dataset.add("b", seed=1)
+    dataset, hashed = Dataset(tmp_path / "d").having("a", "b"), list[str]()
     built(dataset, tmp_path)
     real = plan.hash_sources
     monkeypatch.setattr(plan, "hash_sources", lambda p: hashed.append(p.asset_id) or real(p))

@@ -2,20 +2,18 @@
 
 import json
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import pytest
-from click.testing import CliRunner
+from support.commands import run
 from support.faults import inject
 from support.first_builds import tree_from_nothing
 from support.synthetic import make_asset
 from support.trees import inodes, tree
 
-from slatprep.cli.commands import slatprep
-from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
+from slatprep.parameters import AlignParameters, BuildParameters
 from slatprep.pipeline import recipe
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.store import open_store
@@ -62,8 +60,7 @@ def test_new_changed_and_removed(built, aligned):
     made = make_asset(seed=6)
     dataset.write_slat("b.npz", made.coords, made.feats + 1)
     dataset.write_grid("b", made.grid)
-    shutil.rmtree(dataset.root / "pixieverse" / "c")
-    (dataset.root / "slat" / "c.npz").unlink()
+    dataset.remove("c")
     # Times say nothing: what is touched is not changed.
     for path in dataset.root.rglob("a*.npz"):
         path.touch()
@@ -82,10 +79,10 @@ def test_new_changed_and_removed(built, aligned):
 @pytest.mark.parametrize("what", ["ranges", "shards"])
 def test_other_ranges_and_shards_need_no_alignment(built, aligned, what):
     dataset, out = built
-    other = dataset.parameters("pixie")
-    if what == "shards":
-        other = dataset.parameters()
-        other = replace(other, store=replace(other.store, voxel_chunk=256))
+    if what == "ranges":
+        other = dataset.parameters("pixie")
+    else:
+        other = dataset.parameters(store={"voxel_chunk": 256})
     assert {action for action, _ in reasons(other, out).values()} == {"reuse"}
     assert build_store(other, out).damaged == ()
     assert aligned == []
@@ -94,7 +91,7 @@ def test_other_ranges_and_shards_need_no_alignment(built, aligned, what):
 
 def test_parameters_and_code_that_touch_an_asset_redo_it(built, aligned, monkeypatch):
     dataset, out = built
-    nearer = replace(dataset.parameters(), sample=SampleParameters(max_distance=2.0))
+    nearer = dataset.parameters(sample={"max_distance": 2.0})
     why = "parameters changed: sample.max_distance was 3.0, is 2.0"
     assert reasons(nearer, out) == dict.fromkeys("abc", ("align", why))
     before = open_store(out).attributes["manifest"]
@@ -119,8 +116,7 @@ def test_one_file_of_all_slats_may_grow(make_dataset, aligned, tmp_path):
 
     write("a", 0)
     write("b", 1)
-    parameters = dataset.parameters()
-    parameters = replace(parameters, slat=replace(parameters.slat, root=file))
+    parameters = dataset.parameters(slat={"root": file})
     build_store(parameters, tmp_path / "s.zarr")
     assert len(aligned) == 2
     write("c", 2)
@@ -148,8 +144,7 @@ def test_kept_work_is_used_and_holds_no_more_than_the_store(built, aligned, monk
 
     read: list[str] = []
     inject(monkeypatch, lambda step, name: step == "asset read" and read.append(name))
-    shutil.rmtree(dataset.root / "pixieverse" / "c")
-    (dataset.root / "slat" / "c.npz").unlink()
+    dataset.remove("c")
     assert reasons(dataset.parameters(), out)["a"] == ("resume", "finished by an earlier build")
     build_store(dataset.parameters(), out, keep_work=True)
     assert open_store(out).ids == ["a", "b"]
@@ -160,14 +155,12 @@ def test_kept_work_is_used_and_holds_no_more_than_the_store(built, aligned, monk
 def test_a_dry_run_writes_nothing(built):
     dataset, out = built
     before = tree(out.parent)
-    sources = ["--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat"]
-    command = [str(part) for part in ("build-store", *sources, "--out", out, "--dry-run")]
-    told = CliRunner().invoke(slatprep, [*command, "--json"])
-    assert told.exit_code == 0, told.output
-    document = json.loads(told.stdout)
+    sources = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
+    words = ("build-store", *sources, "--out", out, "--dry-run")
+    document = json.loads(run(*words, "--json").stdout)
     assert document["actions"] == {"align": 0, "reuse": 3, "resume": 0, "refuse": 0, "remove": 0}
     assert all(asset["reason"] == "unchanged" for asset in document["assets"])
-    assert "nothing is written" in CliRunner().invoke(slatprep, command).stdout
+    assert "nothing is written" in run(*words).stdout
     assert tree(out.parent) == before
     dataset.add("d", seed=3)
     added = tree(out.parent)

@@ -3,12 +3,11 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import zarr
-from support.trees import records_of, tree
+from support.trees import records_beside, tree
 
 from slatprep.demo import make_demo
 from slatprep.inspect.check import check_alignment
@@ -55,10 +54,6 @@ def copied(store: Path, to: Path) -> Path:
     return Path(shutil.copytree(store, to))
 
 
-def records_beside(store: Path) -> dict[str, dict[str, Any]]:
-    return records_of(store.with_suffix(".manifests") / "assets.jsonl")
-
-
 def right_labels(root: Path, store: Path) -> dict[str, float]:
     shares = {}
     for asset in open_store(store):
@@ -74,7 +69,7 @@ def mislabelled(root: Path) -> str:
 
 def test_ties_that_change_labels_are_settled_right_and_recorded(telling, stores):
     root = telling[0]
-    alone, heard = (records_beside(store) for store in stores)
+    alone, heard = map(records_beside, stores)
     before, after = (right_labels(root, store) for store in stores)
     settled = [key for key, record in heard.items() if record["alignment"]["settled_by"]]
     differing = [k for k, r in alone.items() if r["judgement"]["ambiguity"]["material_share"] > 0.3]
@@ -100,7 +95,7 @@ def test_ties_that_change_labels_are_settled_right_and_recorded(telling, stores)
 
 
 def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(telling, stores):
-    alone, heard = (records_beside(store) for store in stores)
+    alone, heard = map(records_beside, stores)
     wrong = mislabelled(telling[0])
     assert [key for key, record in heard.items() if record["judgement"]["contradicted"]] == [wrong]
     assert alone[wrong]["judgement"]["verdict"] == "good"

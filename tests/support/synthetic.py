@@ -1,7 +1,8 @@
 """Small assets made of numpy alone, with everything about them known by construction."""
 
+import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -93,6 +94,12 @@ class Dataset:
             self.add(object_id, number)
         return self
 
+    def remove(self, *ids: str) -> None:
+        """Take objects of one view away, or what there is of them."""
+        for object_id in ids:
+            shutil.rmtree(self.root / "pixieverse" / object_id, ignore_errors=True)
+            (self.root / "slat" / f"{object_id}.npz").unlink(missing_ok=True)
+
     def write_grid(self, object_id: str, grid: np.ndarray) -> None:
         """Write a grid as PixieVerse lays it out."""
         path = self.root / "pixieverse" / object_id / "sample_0" / "material_grid.npy"
@@ -105,15 +112,17 @@ class Dataset:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(path, coords=coords, feats=feats)
 
-    def parameters(self, ranges: str = "dataset") -> BuildParameters:
-        """Return the parameters of a build with many small shards."""
-        return BuildParameters(
+    def parameters(self, ranges: str = "dataset", **groups: dict[str, object]) -> BuildParameters:
+        """Return the parameters of a build with many small shards, and with others of groups."""
+        usual = BuildParameters(
             PixieverseSource(self.root / "pixieverse"),
             SlatSource(self.root / "slat"),
             align=AlignParameters(),
             normalize=NormalizeParameters(ranges),
             store=self.shards,
         )
+        changed = {name: replace(getattr(usual, name), **group) for name, group in groups.items()}
+        return replace(usual, **changed)
 
 
 Made = tuple[Dataset, Path]

@@ -47,3 +47,8 @@ def records_of(lines: Path) -> dict[str, dict[str, Any]]:
     if lines.name == "assets.jsonl" and build.exists():
         records += json.loads(build.read_text("utf-8"))["failed"]
     return {record["asset_id"]: record for record in records}
+
+
+def records_beside(store: Path) -> dict[str, dict[str, Any]]:
+    """Return the records of the build of a store."""
+    return records_of(store.with_suffix(".manifests") / "assets.jsonl")

@@ -14,14 +14,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from distributed import LocalCluster
+from support.commands import run
 from support.dask_processes import Processes, end, wait_for_workers, wait_until
+from support.faults import flip
 from support.synthetic import Dataset, Made
 from support.trees import tree
 
 import slatprep
-from slatprep.cli.commands import slatprep as command
 from slatprep.errors import SlatprepError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
@@ -67,13 +67,20 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @contextmanager
-def threads_for_workers(workers: int, threads: int = 1) -> Iterator[LocalCluster]:
+def threads_for_workers(workers: int) -> Iterator[LocalCluster]:
     """A cluster within this process, for what does not depend on its being outside."""
     with LocalCluster(
-        n_workers=workers, threads_per_worker=threads, processes=False,
+        n_workers=workers, threads_per_worker=1, processes=False,
         protocol="tcp://", dashboard_address=None,
     ) as started:  # fmt: skip
         yield started
+
+
+@pytest.fixture(scope="module")
+def threads() -> Iterator[str]:
+    """Two workers within this process."""
+    with threads_for_workers(2) as started:
+        yield started.scheduler_address
 
 
 # -- a build ----------------------------------------------------------------
@@ -146,9 +153,7 @@ def test_the_other_commands_find_the_same(address, local, tmp_path):
     damaged = tmp_path / "damaged.zarr"
     shutil.copytree(store, damaged)
     shard = max((damaged / "voxel" / "feats").rglob("*"), key=lambda path: path.stat().st_size)
-    content = bytearray(shard.read_bytes())
-    content[100] ^= 1
-    shard.write_bytes(content)
+    flip(shard, 100)
     with Cluster(address) as cluster:
         aligned = align_pairs(parameters, tmp_path / "cluster.jsonl", jobs=cluster)
         plan = plan_build(parameters, store, jobs=cluster)
@@ -156,8 +161,7 @@ def test_the_other_commands_find_the_same(address, local, tmp_path):
     assert aligned.build_id == align_pairs(parameters, tmp_path / "here.jsonl").build_id
     assert plan.actions["reuse"] == 6
     assert findings == verify_store(damaged).findings
-    result = CliRunner().invoke(command, ["verify", str(store), "-q", "--scheduler", address])
-    assert result.exit_code == 0, result.output
+    run("verify", store, "-q", "--scheduler", address)
 
 
 # -- what a worker must have ------------------------------------------------
@@ -261,24 +265,37 @@ def test_the_first_worker_is_waited_for():
 
 
 def test_jobs_and_scheduler_exclude_each_other():
-    options = ["--jobs", "2", "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr"]
-    result = CliRunner().invoke(command, ["build-store", *options])
-    assert result.exit_code == 2
+    options = ("--jobs", 2, "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr")
+    result = run("build-store", *options, code=2)
     assert "--jobs is for this machine" in result.output
 
 
 # -- tasks ------------------------------------------------------------------
 
 
-def test_one_worker_computes_and_not_this_thread():
-    with threads_for_workers(1) as started, Cluster(started.scheduler_address) as cluster:
+def test_workers_compute_and_not_this_thread(threads):
+    with Cluster(threads) as cluster:
         idents = set(cluster.run_unordered(threading.get_ident, [()] * 5))
         assert threading.get_ident() not in idents
         variables = [(name,) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")]
         assert list(cluster.run_unordered(os.getenv, variables)) == ["1", "1"]
 
 
-def test_tasks_are_taken_as_workers_come_free():
+def test_short_tasks_travel_together_and_each_is_done_once(threads):
+    with Cluster(threads) as cluster:
+        results = list(cluster.run_unordered(divmod, ((n, 7) for n in range(20_000))))
+    assert sorted(results) == sorted(divmod(n, 7) for n in range(20_000))
+
+
+def test_an_error_of_a_task_arrives_as_it_is(threads):
+    with Cluster(threads) as cluster:
+        with pytest.raises(ZeroDivisionError):
+            list(cluster.run_unordered(divmod, [(1, 1), (1, 0)]))
+        with pytest.raises(FileNotFoundError, match="no-such-file"):
+            list(cluster.run_unordered(os.stat, [("no-such-file",)]))
+
+
+def test_tasks_are_taken_as_workers_come_free(threads):
     taken = 0
 
     def tasks() -> Iterator[tuple[float]]:
@@ -287,22 +304,8 @@ def test_tasks_are_taken_as_workers_come_free():
             taken += 1
             yield (0.5,)
 
-    with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
+    with Cluster(threads) as cluster:
         results = cluster.run_unordered(time.sleep, tasks())
         next(results)
-        results.close()  # type: ignore[attr-defined]
+        results.close()
         assert taken < 100
-
-
-def test_short_tasks_travel_together_and_each_is_done_once():
-    with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
-        results = list(cluster.run_unordered(divmod, ((n, 7) for n in range(20_000))))
-    assert sorted(results) == sorted(divmod(n, 7) for n in range(20_000))
-
-
-def test_an_error_of_a_task_arrives_as_it_is():
-    with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
-        with pytest.raises(ZeroDivisionError):
-            list(cluster.run_unordered(divmod, [(1, 1), (1, 0)]))
-        with pytest.raises(FileNotFoundError, match="no-such-file"):
-            list(cluster.run_unordered(os.stat, [("no-such-file",)]))
