@@ -1,17 +1,14 @@
 """Builds that are killed, starved or refused: each by doing it to a real build."""
 
 import json
-import os
 import random
 import shutil
 import signal
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
-from support.build_process import kill_at, prepared, run
-from support.faults import environment
+from support.build_process import Build, kill_at
 from support.rights import BOUND_BY_PERMISSIONS
 from support.synthetic import Dataset, Made, make_asset
 from support.trees import tree
@@ -25,12 +22,6 @@ from slatprep.store import open_store
 
 
 @pytest.fixture
-def script(tmp_path: Path) -> Path:
-    (tmp_path / "script").mkdir()
-    return tmp_path / "script" / "run_build.py"
-
-
-@pytest.fixture
 def reference(undisturbed: Made, tmp_path: Path) -> tuple[Dataset, dict[str, str]]:
     """Three assets that may be changed, and the hashes of what is to come of them."""
     dataset, store = undisturbed
@@ -41,27 +32,18 @@ def reference(undisturbed: Made, tmp_path: Path) -> tuple[Dataset, dict[str, str
 @pytest.fixture(scope="module")
 def old_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("old")
-    dataset = Dataset(folder / "sources")
-    dataset.add("z", seed=3)
-    build_store(dataset.parameters("pixie"), folder / "s.zarr")
-    return folder / "s.zarr"
+    dataset = Dataset(folder / "sources").having("z", seed=3)
+    return Path(str(build_store(dataset.parameters("pixie"), folder / "s.zarr").store))
 
 
 def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
     """Run the build again and hold the result against what no fault has touched."""
     summary = build_store(dataset.parameters("pixie"), out)
     assert tree(out) == expected
-    names = {path.name for path in out.parent.iterdir()}
-    assert {name for name in names if name.lstrip(".").startswith("s.")} == {
-        "s.zarr",
-        "s.manifests",
-    }
-    manifests = out.with_name(f"{out.stem}.manifests")
-    assert {path.name for path in manifests.iterdir()} == {
-        "assets.jsonl",
-        "build.json",
-        "sources.seen",
-    }
+    manifests = out.with_suffix(".manifests")
+    assert {path.name for path in out.parent.glob("*s.*")} == {out.name, manifests.name}
+    kept = {path.name for path in manifests.iterdir()}
+    assert kept == {"assets.jsonl", "build.json", "sources.seen"}
     assert json.loads((manifests / "build.json").read_text())["id"] == summary.build_id
     assert len((manifests / "assets.jsonl").read_text().splitlines()) == 3
 
@@ -77,28 +59,28 @@ def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
         ("manifests written", 0),
     ],
 )
-def test_killed_at_every_step(reference, old_store, script, tmp_path, step, calls):
+def test_killed_at_every_step(reference, old_store, tmp_path, step, calls):
     dataset, expected = reference
     out = tmp_path / "s.zarr"
     shutil.copytree(old_store, out)
     before = tree(out)
 
-    killed = run(script, dataset, out, kill_at(step, calls))
+    killed = Build(dataset, out, kill_at(step, calls)).done()
     assert killed.returncode == -signal.SIGKILL, killed.stderr
 
     assert tree(out) in (before, expected)
     ends_well(dataset, out, expected)
 
 
-def test_what_was_finished_is_not_done_again(reference, script, tmp_path):
+def test_what_was_finished_is_not_done_again(reference, tmp_path):
     dataset, expected = reference
-    killed = run(script, dataset, tmp_path / "s.zarr", kill_at("asset begun", 2))
+    killed = Build(dataset, tmp_path / "s.zarr", kill_at("asset begun", 2)).done()
     assert killed.returncode == -signal.SIGKILL
     # A torn file, as a power failure leaves it, is known and done again.
     torn, *_ = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.arrays"))
     torn.write_bytes(torn.read_bytes()[:-2000])
     # One was finished, so two alignments are enough.
-    again = run(script, dataset, tmp_path / "s.zarr", kill_at("asset aligned", 2))
+    again = Build(dataset, tmp_path / "s.zarr", kill_at("asset aligned", 2)).done()
     assert again.returncode == 0, again.stderr
     assert tree(tmp_path / "s.zarr") == expected
 
@@ -117,44 +99,26 @@ def test_a_kill_between_two_renames_is_mended(reference, tmp_path):
     assert not work.exists()
 
 
-def test_a_worker_that_dies_costs_nothing(reference, script, tmp_path):
-    dataset, expected = reference
-    died = str(tmp_path / "died")
-    fault = f"""
-if (step, name) == ("asset begun", "b") and not os.path.exists({died!r}):
-    open({died!r}, "w").close()
-    kill_self()
-"""
-    done = run(script, dataset, tmp_path / "s.zarr", fault, jobs=2)
-    assert done.returncode == 0, done.stderr
-    assert Path(died).exists()
-    assert tree(tmp_path / "s.zarr") == expected
-
-
-def test_a_worker_that_dies_with_a_shard_open_leaves_nothing_of_it(reference, script, tmp_path):
+@pytest.mark.parametrize("when", ["(step, name) == ('asset begun', 'b')", "step == 'shard filled'"])
+def test_a_worker_that_dies_costs_nothing_and_leaves_nothing(reference, tmp_path, when):
     dataset, expected = reference
     out, died = tmp_path / "s.zarr", str(tmp_path / "died")
     fault = f"""
-if step == "shard filled" and not os.path.exists({died!r}):
+if {when} and not os.path.exists({died!r}):
     open({died!r}, "w").close()
     kill_self()
 """
-    done = run(script, dataset, out, fault, jobs=2)
+    done = Build(dataset, out, fault, jobs=2).done()
     assert done.returncode == 0, done.stderr
     assert Path(died).exists()
     assert tree(out) == expected
     assert verify_store(out).ok
 
 
-DIES_OF_B = """
-if (step, name) == ("asset begun", "b"):
-    kill_self()
-"""
-
-
-def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(reference, script, tmp_path):
+def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(reference, tmp_path):
     dataset, expected = reference
-    done = run(script, dataset, tmp_path / "s.zarr", DIES_OF_B, jobs=2)
+    dies_of_b = "if (step, name) == ('asset begun', 'b'): kill_self()"
+    done = Build(dataset, tmp_path / "s.zarr", dies_of_b, jobs=2).done()
     assert done.returncode == 0, done.stderr
     statuses, problems = json.loads(done.stdout)
     assert statuses == {"ok": 2, "failed": 1, "skipped": 0}
@@ -163,7 +127,7 @@ def test_an_asset_that_kills_its_worker_is_named_and_the_others_go_in(reference,
     ends_well(dataset, tmp_path / "s.zarr", expected)
 
 
-def test_memory_that_runs_out_is_told_of_the_asset(reference, script, tmp_path):
+def test_memory_that_runs_out_is_told_of_the_asset(reference, tmp_path):
     dataset, expected = reference
     fault = """
 import numpy, resource
@@ -176,7 +140,7 @@ if (step, name) == ("asset read", "b"):
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
 """
-    done = run(script, dataset, tmp_path / "s.zarr", fault)
+    done = Build(dataset, tmp_path / "s.zarr", fault).done()
     assert done.returncode == 0, done.stderr
     _, problems = json.loads(done.stdout)
     assert problems["b"].startswith("memory ran out")
@@ -184,7 +148,7 @@ if (step, name) == ("asset read", "b"):
 
 
 @pytest.mark.parametrize("step", ["asset aligned", "shard begun"])
-def test_a_disk_that_takes_no_more(reference, script, tmp_path, step):
+def test_a_disk_that_takes_no_more(reference, tmp_path, step):
     """A limit on the size of files stands in for a full disk: the same error at a write."""
     dataset, expected = reference
     out = tmp_path / "s.zarr"
@@ -193,7 +157,7 @@ import resource
 if step == {step!r}:
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
 """
-    done = run(script, dataset, out, fault)
+    done = Build(dataset, out, fault).done()
     assert done.returncode == 1
     assert done.stderr.startswith("refused: ")
     assert "cannot be written to" in done.stderr
@@ -204,14 +168,14 @@ if step == {step!r}:
     ends_well(dataset, out, expected)
 
 
-def test_a_source_that_vanishes_midway(reference, script, tmp_path):
+def test_a_source_that_vanishes_midway(reference, tmp_path):
     dataset, expected = reference
     slat = str(dataset.root / "slat" / "b.npz")
     fault = f"""
 if (step, name) == ("asset begun", "b"):
     os.unlink({slat!r})
 """
-    done = run(script, dataset, tmp_path / "s.zarr", fault)
+    done = Build(dataset, tmp_path / "s.zarr", fault).done()
     statuses, problems = json.loads(done.stdout)
     assert statuses == {"ok": 2, "failed": 1, "skipped": 0}
     assert "b.npz: does not exist" in problems["b"]
@@ -227,27 +191,26 @@ if (step, name) == ("asset begun", "b"):
         (0o000, "s.zarr: cannot be looked at (Permission denied)"),
     ],
 )
-def test_a_target_that_permissions_keep(reference, script, tmp_path, mode, told):
+def test_a_target_that_permissions_keep(reference, tmp_path, mode, told):
     dataset, expected = reference
     folder = tmp_path / "locked"
     folder.mkdir()
     folder.chmod(mode)
-    done = run(script, dataset, folder / "s.zarr", before=BOUND_BY_PERMISSIONS)
+    done = Build(dataset, folder / "s.zarr", before=BOUND_BY_PERMISSIONS).done()
     folder.chmod(0o755)
     assert done.returncode == 1
     assert told in done.stderr and "Traceback" not in done.stderr
     ends_well(dataset, folder / "s.zarr", expected)
 
 
-def test_the_second_of_two_builds_is_refused_and_told_of_the_first(reference, script, tmp_path):
+def test_the_second_of_two_builds_is_refused_and_told_of_the_first(reference, tmp_path):
     dataset, expected = reference
     out = tmp_path / "s.zarr"
     sleeping = """
 if step == "store created":
     time.sleep(600)
 """
-    command = prepared(script, dataset, out)
-    first = subprocess.Popen(command, env=environment(script.parent, sleeping))
+    first = Build(dataset, out, sleeping)
     try:
         lock = tmp_path / ".s.zarr.work" / "lock"
         while not lock.exists() or not lock.read_text():
@@ -258,12 +221,11 @@ if step == "store created":
             build_store(dataset.parameters("pixie"), out)
     finally:
         first.kill()
-        first.wait()
     assert lock.exists()  # A killed build leaves the file, but not the lock.
     ends_well(dataset, out, expected)
 
 
-def test_workers_do_not_outlive_a_killed_build(reference, script, tmp_path):
+def test_workers_do_not_outlive_a_killed_build(reference, tmp_path):
     dataset, _ = reference
     pids = tmp_path / "pids"
     pids.mkdir()
@@ -272,12 +234,10 @@ if step == "asset begun":
     open(f"{pids}/{{os.getpid()}}", "w").close()
     time.sleep(600)
 """
-    command = prepared(script, dataset, tmp_path / "s.zarr", jobs=2)
-    build = subprocess.Popen(command, env=environment(script.parent, endless))
+    build = Build(dataset, tmp_path / "s.zarr", endless, jobs=2)
     while len(list(pids.iterdir())) < 2:
         time.sleep(0.05)
     build.kill()
-    build.wait()
     workers = [int(path.name) for path in pids.iterdir()]
     end = time.monotonic() + 600
     while any(Path(f"/proc/{pid}/stat").exists() for pid in workers):
@@ -285,7 +245,7 @@ if step == "asset begun":
         time.sleep(0.1)
 
 
-def test_a_few_kills_at_random_times(reference, script, tmp_path):
+def test_a_few_kills_at_random_times(reference, tmp_path):
     """The short version of ``benchmarks/soak_kills.py``."""
     dataset, expected = reference
     out = tmp_path / "s.zarr"
@@ -293,13 +253,10 @@ def test_a_few_kills_at_random_times(reference, script, tmp_path):
     chance = random.Random(0)
     for turn in range(4):
         dataset.add("d", seed=turn)
-        command = prepared(script, dataset, out, jobs=2)
-        build = subprocess.Popen(command, env=environment(script.parent), start_new_session=True)
-        time.sleep(chance.uniform(0.5, 5.0))
-        os.killpg(build.pid, signal.SIGKILL)
-        build.wait()
+        build = Build(dataset, out, jobs=2)
+        time.sleep(chance.uniform(0.1, 4.0))
+        build.kill_all()
         stored = open_store(out)
         assert all(len(stored.asset(asset_id).coords) for asset_id in stored.ids)
-    shutil.rmtree(dataset.root / "pixieverse" / "d")
-    (dataset.root / "slat" / "d.npz").unlink()
+    dataset.remove("d")
     ends_well(dataset, out, expected)

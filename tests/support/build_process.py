@@ -1,35 +1,25 @@
-"""A build in a process of its own, with a fault in it."""
+"""A build in a process of its own, with a fault in it, forked of one that has imported all."""
 
+import json
+import multiprocessing
+import os
+import signal
 import subprocess
 import sys
-from pathlib import Path
-
-from support.faults import environment
-from support.synthetic import Dataset
-
-BUILD = """
-import json, sys
+import time
+import traceback
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from slatprep.errors import SlatprepError
-from slatprep.parameters import *
 from slatprep.pipeline.dataset import build_store
+from support.faults import environment
+from support.synthetic import Dataset
 
-root, out, jobs = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
-{before}
-parameters = BuildParameters(
-    PixieverseSource(root / "pixieverse"),
-    SlatSource(root / "slat"),
-    normalize=NormalizeParameters("pixie"),
-    store=StoreParameters(voxel_chunk=128, voxel_chunks_per_shard=4, grid_assets_per_shard=2),
+_FORKS = multiprocessing.get_context("forkserver")
+_FORKS.set_forkserver_preload(
+    ["zarr", "scipy.ndimage", "scipy.spatial", "slatprep.align.field", "slatprep.pipeline.dataset"]
 )
-if __name__ == "__main__":
-    try:
-        summary = build_store(parameters, out, jobs=jobs)
-    except SlatprepError as error:
-        sys.exit(f"refused: {{error}}")
-    print(json.dumps([summary.statuses, dict(summary.problems)]))
-"""
 
 
 def kill_at(step: str, calls: int = 0) -> str:
@@ -42,21 +32,67 @@ if step == {step!r}:
 """
 
 
-def run(
-    script: Path, dataset: Dataset, out: Path, fault: str = "", jobs: int = 1, before: str = ""
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        prepared(script, dataset, out, jobs, before),
-        env=environment(script.parent, fault),
-        check=False,
-        capture_output=True,
-        text=True,
-    )
+class Build:
+    """A build that was started with Pixie's ranges; `before` are statements to begin with."""
+
+    def __init__(
+        self, dataset: Dataset, out: Path, fault: str = "", jobs: int = 1, before: str = ""
+    ) -> None:
+        variables = environment(dataset.root.parent / "faults", fault)
+        pipes = [_FORKS.Pipe(duplex=False) for _ in range(2)]
+        self._read = [pipe[0] for pipe in pipes]
+        streams = [pipe[1] for pipe in pipes]
+        self._process = _FORKS.Process(
+            target=_build, args=(dataset, out, jobs, before, variables, streams)
+        )
+        self._process.start()
+        self.pid = self._process.pid or 0
+        for stream in streams:
+            stream.close()
+
+    def kill(self) -> None:
+        """Kill it, but not its workers."""
+        self._process.kill()
+        self._process.join()
+
+    def kill_all(self) -> None:
+        """Kill it and its workers."""
+        while os.getpgid(self.pid) != self.pid:
+            time.sleep(0.01)
+        os.killpg(self.pid, signal.SIGKILL)
+        self._process.join()
+
+    def done(self) -> "subprocess.CompletedProcess[str]":
+        """Wait for its end."""
+        self._process.join()
+        told = [os.fdopen(os.dup(pipe.fileno())).read() for pipe in self._read]
+        return subprocess.CompletedProcess([], self._process.exitcode or 0, *told)
 
 
-def prepared(
-    script: Path, dataset: Dataset, out: Path, jobs: int = 1, before: str = ""
-) -> list[str]:
-    """Write a build and return its command."""
-    script.write_text(BUILD.format(before=before))
-    return [sys.executable, str(script), str(dataset.root), str(out), str(jobs)]
+def _build(
+    dataset: Dataset,
+    out: Path,
+    jobs: int,
+    before: str,
+    variables: dict[str, str],
+    streams: list[Connection],
+) -> None:
+    os.setsid()
+    for number, stream in enumerate(streams, 1):
+        os.dup2(stream.fileno(), number)
+        stream.close()
+    os.environ.update(variables)
+    sys.path[:0] = variables["PYTHONPATH"].split(os.pathsep)
+    sys.dont_write_bytecode = True  # The next fault may be written within the same second.
+    code = 1
+    try:
+        exec(before)
+        summary = build_store(dataset.parameters("pixie"), out, jobs=jobs)
+        print(json.dumps([summary.statuses, dict(summary.problems)]), flush=True)
+        code = 0
+    except SlatprepError as error:
+        print(f"refused: {error}", file=sys.stderr, flush=True)
+    except Exception:
+        traceback.print_exc()
+    # An end as of a child process would wait for its own workers, which wait for more work.
+    os._exit(code)
