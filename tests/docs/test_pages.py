@@ -1,14 +1,11 @@
 """The pages of docs/ that show code, messages and habits of the shell."""
 
 import ast
-import contextlib
 import importlib
 import importlib.util
-import io
 import json
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -18,6 +15,7 @@ import nbformat
 import pytest
 from click.testing import CliRunner
 from nbclient import NotebookClient
+from support.commands import run
 
 from slatprep.cli.commands import COMMANDS, slatprep
 
@@ -28,28 +26,6 @@ DOCS = ROOT / "docs"
 def blocks(page: str) -> list[tuple[str, str]]:
     """Return the language and text of every code block of a page, in order."""
     return re.findall(r"^```(\w+)\n(.*?)^```$", (DOCS / page).read_text("utf-8"), re.S | re.M)
-
-
-def test_tutorial_runs_and_prints_what_it_shows(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    namespace: dict[str, object] = {}
-    printed, compared = "", 0
-    for language, text in blocks("tutorial.md"):
-        if language == "python":
-            with contextlib.redirect_stdout(io.StringIO()) as stream:
-                exec(compile(text, "tutorial.md", "exec"), namespace)
-            printed = stream.getvalue()
-        elif language == "text":
-            assert printed == text
-            compared += 1
-        else:
-            for line in text.splitlines():
-                program, *arguments = shlex.split(line)
-                assert program == "slatprep"
-                result = CliRunner().invoke(slatprep, arguments)
-                assert result.exit_code == 0, f"{line}: {result.output}"
-    assert compared >= 10
-    assert (tmp_path / "shards" / "shard-000001.tar").exists()
 
 
 def test_the_page_on_security_says_what_each_command_does_with_files():
@@ -132,41 +108,34 @@ def templates() -> list[str]:
     return found
 
 
-TEMPLATES = templates()
-MESSAGES = [
-    message
-    for section in (DOCS / "troubleshooting.md").read_text("utf-8").split("\n## ")
-    if not section.startswith("Results")
-    for message in re.findall(r"^\| `([^`]+)` \|", section, re.M)
-]
-
-
-def test_troubleshooting_lists_messages():
-    assert len(MESSAGES) >= 30
-    assert len(set(MESSAGES)) == len(MESSAGES)
-
-
-@pytest.mark.parametrize("message", MESSAGES)
-def test_message_is_one_of_the_source(message):
-    pattern = re.compile(".*".join(map(re.escape, message.split("…"))), re.S)
-    assert any(pattern.search(template) for template in TEMPLATES), message
+def test_messages_of_troubleshooting_are_those_of_the_source():
+    said = templates()
+    messages = [
+        message
+        for section in (DOCS / "troubleshooting.md").read_text("utf-8").split("\n## ")
+        if not section.startswith("Results")
+        for message in re.findall(r"^\| `([^`]+)` \|", section, re.M)
+    ]
+    assert len(messages) >= 30
+    assert len(set(messages)) == len(messages)
+    for message in messages:
+        pattern = re.compile(".*".join(map(re.escape, message.split("…"))), re.S)
+        assert any(map(pattern.search, said)), message
 
 
 # -- the shell --------------------------------------------------------------
 
 
-def complete(words: str, shell: str = "bash_complete", cwd: Path | None = None) -> str:
-    environment = {
-        **os.environ,
+def complete(words: str, shell: str = "bash_complete") -> str:
+    """Return what the entry answers to a shell that asks."""
+    asked = {
         "_SLATPREP_COMPLETE": shell,
         "COMP_WORDS": words,
         "COMP_CWORD": str(len(words.split()) - 1),
     }
-    done = subprocess.run(
-        [sys.executable, "-m", "slatprep"], capture_output=True, text=True, env=environment, cwd=cwd
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    return done.stdout
+    result = CliRunner().invoke(slatprep, env=asked, prog_name="slatprep")
+    assert result.exit_code == 0, result.output
+    return result.stdout
 
 
 def test_completion_is_documented_for_every_shell_click_knows():
@@ -184,61 +153,53 @@ def test_completion_script_is_made(shell):
 
 
 def test_commands_options_and_values_complete():
-    assert complete("slatprep exp").splitlines() == ["plain,export"]
+    entry = [sys.executable, "-m", "slatprep"]
+    asked = {"_SLATPREP_COMPLETE": "bash_complete", "COMP_WORDS": "slatprep exp", "COMP_CWORD": "1"}
+    done = subprocess.run(entry, capture_output=True, text=True, env=os.environ | asked)
+    assert "Traceback" not in done.stderr, done.stderr
+    assert done.stdout.splitlines() == ["plain,export"]
     offered = complete("slatprep export x --format w").splitlines()
     assert offered == ["plain,webdataset"]
     assert "plain,--verdict" in complete("slatprep export x --verd").splitlines()
 
 
-def test_asset_ids_complete_from_the_store(mixed_build):
-    store = mixed_build.store
-    assert store is not None
-    offered = complete(f"slatprep export {store.name} --asset bear", cwd=store.parent)
+def test_asset_ids_complete_from_the_store(mixed_build, monkeypatch):
+    monkeypatch.chdir(mixed_build.store.parent)
+    offered = complete("slatprep export mixed.zarr --asset bear")
     assert offered.splitlines() == ["plain,bear.front", "plain,bear.side"]
-    later = f"slatprep export {store.name} --format npz --asset cup --asset d"
-    assert complete(later, cwd=store.parent).splitlines() == ["plain,dog"]
-    assert complete("slatprep export no.zarr --asset b", cwd=store.parent).strip() == ""
+    later = "slatprep export mixed.zarr --format npz --asset cup --asset d"
+    assert complete(later).splitlines() == ["plain,dog"]
+    assert complete("slatprep export no.zarr --asset b").strip() == ""
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("export", "STORE", "--format", "npz", "--out", "x", "--asset", "cuo"),
-        ("check-alignment", "--store", "STORE", "--asset", "cuo"),
-    ],
-    ids=lambda arguments: arguments[0],
-)
-def test_wrong_asset_is_answered_with_the_one_it_might_be(
-    arguments, mixed_build, tmp_path, monkeypatch
-):
+def test_wrong_asset_is_answered_with_the_one_it_might_be(mixed_build, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = [str(mixed_build.store) if word == "STORE" else word for word in arguments]
-    result = CliRunner().invoke(slatprep, words)
-    assert result.exit_code == 2
-    assert "has no asset 'cuo'; did you mean cup?" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    store = mixed_build.store
+    for words in (
+        ("export", store, "--format", "npz", "--out", "x"),
+        ("check-alignment", "--store", store),
+    ):
+        told = run(*words, "--asset", "cuo", code=2).stderr
+        assert "has no asset 'cuo'; did you mean cup?" in told
+        assert len(told.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (
-            ("--format", "npz", "--points", "grid"),
-            "--points is for --format ply or voxel_data or usd, not npz",
-        ),
-        (("--format", "ply", "--shard-size", "3"), "--shard-size is for --format webdataset"),
+        ("npz --points grid", "--points is for --format ply or voxel_data or usd, not npz"),
+        ("ply --shard-size 3", "--shard-size is for --format webdataset"),
     ],
 )
 def test_option_without_effect_is_refused(options, said, mixed_build, tmp_path):
-    words = ["export", str(mixed_build.store), "--out", str(tmp_path / "x"), *options]
-    result = CliRunner().invoke(slatprep, words)
-    assert result.exit_code == 2 and said in result.stderr
+    words = ("export", mixed_build.store, "--out", tmp_path / "x", "--format", *options.split())
+    assert said in run(*words, code=2).stderr
 
 
 def test_quiet_export_prints_nothing(mixed_build, tmp_path):
-    words = ["export", str(mixed_build.store), "--format", "ply", "--frame", "pixieverse"]
-    loud = CliRunner().invoke(slatprep, [*words, "--out", str(tmp_path / "a")])
+    words = ("export", mixed_build.store, "--format", "ply", "--frame", "pixieverse")
+    loud = run(*words, "--out", tmp_path / "a")
     assert "have no world bounds" in loud.stderr and "Exported to" in loud.stdout
-    quiet = CliRunner().invoke(slatprep, [*words, "--out", str(tmp_path / "b"), "-q"])
+    quiet = run(*words, "--out", tmp_path / "b", "-q")
     assert quiet.output == "" and len(list((tmp_path / "b").glob("*.ply"))) == 5
