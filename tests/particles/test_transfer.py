@@ -206,7 +206,7 @@ def test_gaussians_of_another_tool_are_not_taken_for_trellis(
         told = commands.run("transfer", *words).stderr
         assert f"another tool's than TRELLIS ({sign}): read as they are" in told
     else:
-        told = run_wrong(*words)
+        told = commands.refused("transfer", *words)
         assert sign in told and "half of them" in told
 
 

@@ -10,7 +10,7 @@ from support.trees import inodes, records_of
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline import previous
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.store import manifests, open_store, records, writer
+from slatprep.store import layout, manifests, open_store, records
 from slatprep.store.layout import ARRAYS
 
 pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
@@ -59,11 +59,11 @@ def test_an_update_writes_what_is_new_and_the_last_shards(built):
     store = open_store(out)
     written = {out / name for name, number in inodes(out).items() if before.get(name) != number}
     of_rows = set()
-    for layout in ARRAYS:
-        group = layout.name.partition("/")[0]
+    for array in ARRAYS:
+        group = array.name.partition("/")[0]
         if group == "asset":
             continue
-        reader, first = store.reader(layout.name), rows if group == "voxel" else 3
+        reader, first = store.reader(array.name), rows if group == "voxel" else 3
         shards = range(first // reader.shard_rows, -(-reader.shape[0] // reader.shard_rows))
         of_rows |= {out / reader.key(shard) for shard in shards}
     assert of_rows <= written
@@ -79,9 +79,9 @@ def test_an_update_writes_what_is_new_and_the_last_shards(built):
 @pytest.fixture
 def two_a_shard(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut records into shards of two rows."""
-    for module in (manifests, previous, writer):
+    for module in (layout, manifests, previous):
         monkeypatch.setattr(module, "RECORDS_IN_SHARD", 2)
-    for module in (records, writer):
+    for module in (layout, records):
         monkeypatch.setattr(module, "RECORDS_IN_CHUNK", 2)
 
 
