@@ -106,7 +106,7 @@ def _search(pair: Pair) -> Alignment:
     tied, deformed = finish(pair, near, rough=poses[0].score < CLEAN)
     best = tied[0]
     # What was found of those near says more than the scores that they had before.
-    others = pair.others(best, [*tied[1:], *poses[len(near) :]])
+    others = pair.others(best, [*tied[1:], *(pose for pose in poses if pose not in near)])
 
     fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
     transform = best.similarity.transform
@@ -126,11 +126,11 @@ def _search(pair: Pair) -> Alignment:
         ),
         score=best.score,
         deformation=deformed.deformation,
-        figures=replace(
-            _figures(pair, best, deformed),
-            clear_by=min(
-                (pose.behind for pose in others if pose.merit > best.merit - TIE), default=nan
-            ),
+        figures=_figures(
+            pair,
+            best,
+            deformed,
+            min((pose.behind for pose in others if pose.merit > best.merit - TIE), default=nan),
         ),
     )
 
@@ -178,9 +178,10 @@ def fitted_near(
     return placement, rank_of(best.similarity, deformed.figures) - before
 
 
-def _figures(pair: Pair, best: Pose, deformed: Deformed) -> FitFigures:
+def _figures(pair: Pair, best: Pose, deformed: Deformed, clear_by: float = nan) -> FitFigures:
     poor = best.score < POOR
-    return replace(deformed.figures, mirrored=mirror_gain(pair, best.similarity, poor))
+    mirrored = mirror_gain(pair, best.similarity, poor)
+    return replace(deformed.figures, mirrored=mirrored, clear_by=clear_by)
 
 
 def _is_poor(poses: Sequence[Pose]) -> bool:

@@ -50,10 +50,12 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     best, deformed = _deformed(pair, first, rough)
     if deformed.deformation is None:
         near = [pose for pose in others if pose.merit > best.merit - TIE]
-        fits = [replace(deformed, pose=pose.similarity, warp=_unbent(pose)) for pose in near]
-        behind = standard_errors(pair, deformed, fits)
-        told = [replace(pose, behind=by) for pose, by in zip(near, behind, strict=True)]
-        return [best, *told, *others[len(near) :]], deformed
+        fits = [
+            replace(deformed, pose=pose.similarity, warp=Warp.unbent(pose.similarity))
+            for pose in near
+        ]
+        far = [pose for pose in others if pose not in near]
+        return [best, *_told_apart(pair, deformed, near, fits), *far], deformed
     few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
     contested = [(best, deformed), *(_deformed(pair, pose, rough) for pose in few)]
     ranks = np.array([rank_of(pose.similarity, bent.figures) for pose, bent in contested])
@@ -69,9 +71,16 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
             below = max(float(ranks[order[0]] - ranks[k]), 0.0)
             bonus = highest - below - pose.score
             kept.append((replace(pose, bonus=bonus, standing=0.0), bent, places))
-    behind = standard_errors(pair, kept[0][1], [bent for _, bent, _ in kept])
-    told = [replace(pose, behind=by) for (pose, _, _), by in zip(kept, behind, strict=True)]
-    return [*told, *rest], kept[0][1]
+    (best, *near), (deformed, *fits), _ = zip(*kept, strict=True)
+    return [best, *_told_apart(pair, deformed, near, fits), *rest], deformed
+
+
+def _told_apart(
+    pair: Pair, best: Deformed, poses: Sequence[Pose], fits: Sequence[Deformed]
+) -> list[Pose]:
+    """Return poses with how far they are behind the best, by their fits."""
+    behind = standard_errors(pair, best, fits)
+    return [replace(pose, behind=by) for pose, by in zip(poses, behind, strict=True)]
 
 
 def standard_errors(pair: Pair, best: Deformed, others: Sequence[Deformed]) -> list[float]:
@@ -99,10 +108,6 @@ def _kernels(pair: Pair, fit: Deformed) -> tuple[Array, Array]:
     sides = residuals.at(fit.warp)
     kernels = [0.5 / len(side) / (1.0 + (side / SHARP) ** 2) for side in sides]
     return np.concatenate(kernels), residuals.places.copy()
-
-
-def _unbent(pose: Pose) -> Warp:
-    return Warp(np.eye(3, 4), pose.similarity.offset)
 
 
 def rank_of(similarity: Similarity, figures: FitFigures) -> float:

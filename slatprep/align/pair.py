@@ -65,8 +65,10 @@ def first_of_each(places, distance, most):  # type: ignore[no-untyped-def]
     kept = np.empty(min(most, len(places)), np.intp)
     found = 0
     for k in range(len(places)):
+        if found == most:
+            break
         apart = ((places[kept[:found]] - places[k]) ** 2).sum(axis=1)
-        if found < most and (apart >= distance**2).all():
+        if (apart >= distance**2).all():
             kept[found] = k
             found += 1
     return kept[:found]

@@ -53,7 +53,7 @@ class Residuals:
 
     def start(self) -> Warp:
         """Return the warp that leaves the similarity as it is."""
-        return Warp(np.eye(3, 4), self._pose.offset)
+        return Warp.unbent(self._pose)
 
     def all_samples(self) -> NDArray[np.intp]:
         """Return the rows of all samples."""

@@ -60,7 +60,7 @@ class Stretched:
 
 
 def _unstretched(poses: Iterable[Pose]) -> list[Stretched]:
-    return [Stretched(pose, Warp(np.eye(3, 4), pose.similarity.offset)) for pose in poses]
+    return [Stretched(pose, Warp.unbent(pose.similarity)) for pose in poses]
 
 
 def search_all(pair: Pair) -> tuple[list[Pose], list[Pose]]:

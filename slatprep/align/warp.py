@@ -28,6 +28,11 @@ class Warp(NamedTuple):
     spacing: float = NO_SPACING
     coefficients: Array = np.zeros((4, 4, 4, 3))
 
+    @classmethod
+    def unbent(cls, pose: Similarity) -> Warp:
+        """Return the warp that leaves a similarity as it is."""
+        return cls(np.eye(3, 4), pose.offset)
+
     @property
     def has_lattice(self) -> bool:
         """Whether there is a lattice, be it all zeros."""
