@@ -31,10 +31,9 @@ from support.synthetic import Dataset, make_asset
 
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.published import wanted_members
-from slatprep.storage.ahead import ReadAhead
 from slatprep.storage.archives import Archive
 from slatprep.storage.files import LocalFile
-from slatprep.storage.tar import entries
+from slatprep.storage.tar import ReadAhead, entries
 
 NAME = "vlongle/pixieverse"
 CUBE = 64**3

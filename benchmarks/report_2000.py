@@ -28,7 +28,7 @@ from slatprep.inspect.report import write_report
 from slatprep.parameters import StoreParameters
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS, RECORD_ARRAY
-from slatprep.store.manifests import manifests_of
+from slatprep.store.records import manifests_of
 from slatprep.store.writer import create_store, open_for_writing
 
 RUNS = 3

@@ -49,7 +49,7 @@ from slatprep.inspect.verify.manifests import manifest_findings
 from slatprep.pipeline.dataset import build_store
 from slatprep.storage.faults import VARIABLE
 from slatprep.store import open_store
-from slatprep.store.manifests import manifests_of
+from slatprep.store.records import manifests_of
 from slatprep.workers.dask import Cluster
 from slatprep.workers.local import Jobs
 

@@ -134,7 +134,7 @@ def decode_slat(
     """
     from slatprep import extract as work
     from slatprep.records import TRELLIS
-    from slatprep.storage.names import file_name
+    from slatprep.storage.files import file_name
 
     read = LatentsReader(output, source, assets, TRELLIS, standardised)
     session = model.load(output)

@@ -109,7 +109,7 @@ def _source_of_categories(overview: StoreOverview) -> str:
     """Say what gives a store the categories of its assets, as far as its records tell."""
     from slatprep.errors import StoreError
     from slatprep.storage.place import place_of
-    from slatprep.store.manifests import build_in, manifests_beside
+    from slatprep.store.records import build_in, manifests_beside
 
     table, form = '"obj_ids_metadata.json"', ""
     try:

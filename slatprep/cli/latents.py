@@ -79,13 +79,13 @@ class LatentsReader:
 
     def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
         """Return the latents of a file with `standardised` set."""
-        from slatprep.readers import encoders
+        from slatprep.readers import contents
 
         if self.standardised != "auto":
             return replace(latents, standardised=self.standardised == "yes")
         if not self._look_standardised(latents):
             return latents
-        how = encoders.in_words(latents.moments)
+        how = contents.in_words(latents.moments)
         self.output.note(
             f"{latents.sources[0].path}: its latents look standardised already ({how}) and are "
             "taken so; --standardised says otherwise"
@@ -94,20 +94,20 @@ class LatentsReader:
 
     def _look_standardised(self, latents: StructuredLatents) -> bool:
         """Whether latents look standardised; asks the other files where they alone do not tell."""
-        from slatprep.readers import encoders
+        from slatprep.readers import contents
 
         moments = latents.moments
-        if len(latents.coords) < encoders.ENOUGH or encoders.tell_alone(moments, self.space):
-            return encoders.look_standardised(moments, self.space)
+        if len(latents.coords) < contents.ENOUGH or contents.tell_alone(moments, self.space):
+            return contents.look_standardised(moments, self.space)
         known = list(self._moments_of_files())
         if len(known) < 2:
             raise InputError(
                 latents.sources[0].path,
                 "one file alone does not tell whether its latents have been standardised "
-                f"({encoders.in_words(moments)})",
+                f"({contents.in_words(moments)})",
                 "--standardised yes or no",
             )
-        return encoders.look_standardised(encoders.pooled_moments(known), self.space)
+        return contents.look_standardised(contents.pooled_moments(known), self.space)
 
     def _moments_of_files(self) -> Iterator[tuple[int, LatentMoments]]:
         """Yield voxels and moments of the first files that can be read."""

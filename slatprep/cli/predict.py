@@ -185,7 +185,7 @@ def _write_gaussians(output: Output, image: _Image, out: Path, path: Path, far: 
     from slatprep.particles.fields import predicted_field
     from slatprep.particles.read import read_particles
     from slatprep.readers import read_slat
-    from slatprep.storage.names import file_name
+    from slatprep.storage.files import file_name
 
     plain = out / "gaussians.ply"
     decode_gaussians(image.session, read_slat(image.latents, image.latents.parent), plain)

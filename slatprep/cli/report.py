@@ -43,7 +43,7 @@ def report(
     """
     from slatprep.inspect.report import write_report
     from slatprep.store import open_store
-    from slatprep.store.manifests import manifests_beside
+    from slatprep.store.records import manifests_beside
 
     opened = open_store(store)
     name = store.name.removesuffix(".zarr")

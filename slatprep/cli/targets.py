@@ -52,8 +52,8 @@ def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
 
 def _inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
     """Yield files and folders among options, by name, and the records of stores."""
-    from slatprep.store.manifests import manifests_of
     from slatprep.store.reader import is_store
+    from slatprep.store.records import manifests_of
 
     for name, value in given.items():
         for one in value if isinstance(value, tuple) else (value,):

@@ -60,7 +60,7 @@ def verify(
     if (pixieverse is None) != (slat is None) or (also and slat is None):
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
     from slatprep.inspect.verify import SourceRoots, verify_store
-    from slatprep.store.manifests import manifests_beside
+    from slatprep.store.records import manifests_beside
 
     roots = None
     if pixieverse and slat:
@@ -97,7 +97,7 @@ def verify(
 def _left_by_make(store: Place) -> Place | None:
     """Return the folder where `make align` leaves a store's records, if they are of this build."""
     from slatprep.store import open_store
-    from slatprep.store.manifests import build_in
+    from slatprep.store.records import build_in
 
     folder = Path("manifests/build") / store.name.removesuffix(".zarr")
     try:

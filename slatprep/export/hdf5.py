@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from slatprep.export.formats import Exported, ExportOptions, Writer, describe_columns, with_merged
 from slatprep.export.target import FORMAT
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
 from slatprep.store.layout import MERGED_COLUMNS
 

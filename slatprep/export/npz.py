@@ -16,7 +16,7 @@ import numpy as np
 
 from slatprep.errors import ConfigError
 from slatprep.export.formats import TARGETS, Exported, ExportOptions, Writer, with_merged
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
 
 METADATA = "metadata.csv"

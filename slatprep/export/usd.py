@@ -22,7 +22,7 @@ from slatprep.export import formats
 from slatprep.export.bins import Binned, bin_materials
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
 
 SCENE = "scene.usda"

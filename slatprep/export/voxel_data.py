@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slatprep.export.formats import Exported, ExportOptions, Points, Writer, annotated_points
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
 
 VOXEL = np.dtype(

@@ -11,7 +11,7 @@ import numpy as np
 import orjson
 
 from slatprep.export import formats
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
 
 

@@ -31,8 +31,7 @@ from slatprep.records import (
     StructuredLatents,
 )
 from slatprep.storage.atomic import staged
-from slatprep.storage.files import file_digest
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_digest, file_name
 
 BATCH_VOXELS = 65_536
 """Voxels at which a batch is full; an asset with more is a batch by itself."""

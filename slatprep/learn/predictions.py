@@ -34,7 +34,7 @@ from slatprep.records import (
     Verdict,
 )
 from slatprep.storage.documents import read_document
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.storage.place import storage_of
 
 RUN_FILE = "run.json"
@@ -128,7 +128,7 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
     """Open predictions of any form; yield a function that reads those of an asset.
 
     They are a folder of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5 file, with ids
-    encoded by `slatprep.storage.names.file_name`. InputError if they are none of these.
+    encoded by `slatprep.storage.files.file_name`. InputError if they are none of these.
     """
     if path.is_dir():
         zarr = any((path / name).exists() for name in ("zarr.json", ".zgroup"))

@@ -185,7 +185,7 @@ def _paths_of(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], st
     for name in _PATHS:
         group, _, key = name.partition(".")
         tables = data.get(group)
-        for table in tables if isinstance(tables, list) else (tables,):
+        for table in tables if isinstance(tables, list | tuple) else (tables,):
             if isinstance(table, dict) and key in table:
                 yield name, table, key
 
@@ -232,12 +232,8 @@ def _keys_of(groups: tuple[str, ...]) -> list[str]:
 
 
 def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
-    paths = [
-        (name, key, getattr(one, key))
-        for name, (group, key) in ((name, name.split(".")) for name in _PATHS)
-        for one in (parameters.also if group == "also" else (getattr(parameters, group),))
-    ]
-    for name, key, value in paths:
+    for name, table, key in _paths_of(asdict(parameters)):
+        value = table[key]
         if value is None or not _is_path(key, value):
             continue
         try:

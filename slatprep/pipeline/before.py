@@ -25,7 +25,7 @@ from slatprep.pipeline.seen import bound_to, look, read_seen, store_state, write
 from slatprep.records import AssetPair, Contents, Place
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
-from slatprep.store.manifests import BUILD, file_names
+from slatprep.store.records import BUILD, file_names
 from slatprep.workers.local import Jobs, run_unordered
 
 SHARE = 0.01

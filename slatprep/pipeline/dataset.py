@@ -87,7 +87,7 @@ def build_store(
         one is finished; assets that did not change are not aligned again.
     manifests : str or Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the
-        store, see `slatprep.store.manifests.manifests_of`.
+        store, see `slatprep.store.records.manifests_of`.
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`. The store's bytes do
         not depend on it.

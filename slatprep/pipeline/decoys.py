@@ -22,10 +22,9 @@ from slatprep.storage.atomic import writing
 from slatprep.storage.documents import read_bounded
 from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
-from slatprep.store.manifests import manifests_of
 from slatprep.store.record import StageParameters
 from slatprep.store.record_json import adapter_of
-from slatprep.store.records import StoredRecords
+from slatprep.store.records import StoredRecords, manifests_of
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, run_unordered
 

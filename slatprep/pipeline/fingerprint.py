@@ -37,7 +37,7 @@ _NOT_NUMBERS = (
 
 # Whichever way bytes come from a disk or a network, their digest tells them; but
 # these make values of them.
-_DECODING = ("slatprep.storage.chunks", "slatprep.storage.codecs")
+_DECODING = ("slatprep.storage.chunks",)
 
 
 PACKING = (
@@ -46,7 +46,6 @@ PACKING = (
     "slatprep.pipeline.recipe",
     "slatprep.pipeline.rows",
     "slatprep.pipeline.spool",
-    "slatprep.store.columns",
     "slatprep.store.layout",
     "slatprep.store.record_json",
     "slatprep.store.shard_writer",

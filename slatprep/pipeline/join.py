@@ -29,8 +29,8 @@ from slatprep.records import Contents, LatentSpace, Normalization, Place, Proper
 from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
 from slatprep.store import open_store
-from slatprep.store.manifests import build_in, manifests_beside
 from slatprep.store.record_json import adapter_of
+from slatprep.store.records import build_in, manifests_beside
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most
 

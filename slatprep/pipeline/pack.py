@@ -35,11 +35,11 @@ from slatprep.store.writer import (
     GROUPS,
     Shard,
     create_store,
+    cuts_of,
     finish_store,
     merges,
     open_for_writing,
     packing_of,
-    shard_rows,
     shards,
 )
 from slatprep.workers.local import Jobs, run_unordered
@@ -314,13 +314,12 @@ def _taken(
     if not (new.replaces and new.stores):
         return frozenset(), frozenset()
     held, taken = new.stores[0].store, set()
-    rows = shard_rows(new.parameters, new.offsets[-1])
-    for group in GROUPS:
+    for group, (_, rows) in cuts_of(new.parameters, new.offsets[-1]).items():
         names = arrays_in(group, new.merged)
-        if not all(held.holds(n) and held.reader(n).shard_rows == rows[group] for n in names):
+        if not all(held.holds(n) and held.reader(n).shard_rows == rows for n in names):
             continue
-        for number in range(-(-runs[group].new // rows[group])):
-            run = runs[group].holds(number * rows[group], (number + 1) * rows[group])
+        for number in range(-(-runs[group].new // rows)):
+            run = runs[group].holds(number * rows, (number + 1) * rows)
             if run is not None and run.shift == 0:
                 taken.add((group, number))
     return frozenset(taken), frozenset(number for group, number in taken if group == "record")

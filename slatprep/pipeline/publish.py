@@ -23,16 +23,6 @@ from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
-from slatprep.store.manifests import (
-    ASSETS,
-    BUILD,
-    MAX_BUILD_BYTES,
-    build_in,
-    file_names,
-    lines_of,
-    manifests_of,
-    stale_files,
-)
 from slatprep.store.reader import Store, is_store, require_outside
 from slatprep.store.record import (
     AssetRecord,
@@ -42,6 +32,16 @@ from slatprep.store.record import (
     Record,
 )
 from slatprep.store.record_json import to_json
+from slatprep.store.records import (
+    ASSETS,
+    BUILD,
+    MAX_BUILD_BYTES,
+    build_in,
+    file_names,
+    lines_of,
+    manifests_of,
+    stale_files,
+)
 
 _MARKS = {BUILD: b'"slatprep-build-record"', ASSETS: b'"slatprep-asset-record"'}
 """Files beside a store, and what each says at its beginning."""

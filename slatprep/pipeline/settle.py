@@ -21,7 +21,7 @@ from slatprep.pipeline.rows import NextStore, Row, column, in_order, moments_of
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import nothing_usable
 from slatprep.readers import contents_of
-from slatprep.readers.encoders import resolve_latents
+from slatprep.readers.contents import resolve_latents
 from slatprep.readers.ranges import pixie_ranges, read_ranges
 from slatprep.readers.splits import Shares, assign_splits, read_id_file
 from slatprep.records import PROPERTIES, AssetPair, Contents, Normalization, Property

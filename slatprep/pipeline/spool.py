@@ -35,10 +35,9 @@ from slatprep.storage.atomic import staged_apart, writing
 from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, is_spooled
-from slatprep.store.columns import columns_of
 from slatprep.store.layout import MERGED_COLUMNS
 from slatprep.store.record import AssetRecord, FailedRecord, Record
-from slatprep.store.record_json import digest_of, read_record, to_json
+from slatprep.store.record_json import columns_of, digest_of, read_record, to_json
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import NextStore, Row, moments_of
-from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
-from slatprep.readers.unmatched import explain_unmatched
+from slatprep.readers.contents import ENOUGH, in_words, look_standardised
+from slatprep.readers.joins import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Place, Status
 from slatprep.store import Store
-from slatprep.store.manifests import SEVERAL, file_names
 from slatprep.store.record import FailedRecord
+from slatprep.store.records import SEVERAL, file_names
 
 # What the range would be without an asset: narrower by decades, or by its own widths.
 _WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0

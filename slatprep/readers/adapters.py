@@ -20,7 +20,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.foreign import guarded
 from slatprep.readers.patterns import find_files, list_below, tried_names
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 
 
 @dataclass(frozen=True, slots=True)

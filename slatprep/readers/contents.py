@@ -1,12 +1,23 @@
-"""What a dataset holds, as its sources describe it before any field is read."""
+"""What a dataset holds, as its sources describe it before any field is read.
+
+Of latents it is known which encoder made them, and guessed whether they are standardised.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
 from slatprep.errors import ConfigError
-from slatprep.parameters import BuildParameters
-from slatprep.readers.adapters import Holding, source_adapter
-from slatprep.readers.encoders import latent_space
-from slatprep.records import Contents, Property, labels_of
+from slatprep.parameters import BuildParameters, SlatSource
+from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, source_adapter
+from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
+from slatprep.storage.documents import read_document
+from slatprep.storage.place import place_of
 
 
 def contents_of(parameters: BuildParameters) -> Contents:
@@ -59,3 +70,118 @@ def _disagreement(other: Holding, held: Holding) -> str:
 
 def _described(one: Property) -> str:
     return f"{one.name} in {one.unit}, {'log10' if one.log10 else 'linear'}"
+
+
+ENOUGH = 64
+"""Voxels below which the moments of latents say nothing of whether they are standardised."""
+
+_WIDE_ALONE = 1.2
+"""Spread of the median channel above which one asset alone shows raw latents.
+
+Standardised, a dataset's channels have a spread of 1, and three real SLATs alone 0.66 to 0.79.
+"""
+
+_MAX_BYTES = 2**20
+
+
+def latent_space(source: SlatSource) -> LatentSpace:
+    """Return the space of a source's latents, as far as known before they are read.
+
+    ``source.encoder`` names a latent adapter, or a JSON file with ``encoder`` (a name),
+    ``channels``, ``resolution`` and optionally ``mean`` and ``std``. ConfigError if neither fits.
+    """
+    adapter = latent_adapter(source.encoder)
+    known = adapter.space if adapter else _read_space(place_of(source.encoder))
+    return replace(known, standardised=source.standardised == "yes")
+
+
+def _read_space(path: Place) -> LatentSpace:
+    from pydantic import TypeAdapter
+
+    if path.suffix != ".json":
+        known = ", ".join(adapter_names("slatprep.latents"))
+        raise ConfigError(
+            f"slat.encoder: there is no {str(path)!r}; expected {known}, or a JSON "
+            "file that describes another"
+        )
+    try:
+        document = json.dumps(read_document(path, _MAX_BYTES))
+        space: LatentSpace = TypeAdapter(LatentSpace).validate_json(document)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(
+            f"{path}: describes no encoder ({reason}); expected encoder, channels, resolution, and "
+            "mean and std of each channel if they are known"
+        ) from None
+    return space
+
+
+def resolve_latents(
+    declared: LatentSpace, standardised: str, moments: Sequence[tuple[int, LatentMoments | None]]
+) -> LatentSpace:
+    """Return the space of a dataset's latents, now that all assets have been read.
+
+    `moments` holds the voxel count and moments of each asset, in an order that does not depend on
+    the number of jobs. With `standardised` ``auto``, they decide whether latents are standardised.
+    """
+    known = [(count, one) for count, one in moments if one is not None and count]
+    if not known:
+        return declared
+    pooled = pooled_moments(known)
+    auto = standardised == "auto" and sum(count for count, _ in known) >= ENOUGH
+    if auto and len(known) == 1 and not tell_alone(pooled, declared):
+        raise ConfigError(
+            "slat.standardised: one asset alone does not tell whether its latents have been "
+            f'standardised ({in_words(pooled)}); say "yes" or "no"'
+        )
+    if auto:
+        declared = replace(declared, standardised=look_standardised(pooled, declared))
+    if not declared.mean and not declared.standardised:
+        # A channel that never changes is left as wide as it is.
+        std = tuple(s if s > 0 else 1.0 for s in pooled.std)
+        declared = replace(declared, mean=pooled.mean, std=std)
+    return declared
+
+
+def look_standardised(moments: LatentMoments, space: LatentSpace) -> bool:
+    """Whether latents look standardised already.
+
+    Their spread must be near 1: between 0.5 and 1.5 in the median channel. A standard normal
+    must also explain them better than normals with the encoder's mean and standard deviation.
+    Where those are unknown, their mean must be near 0 instead.
+    """
+    mean, std = np.array(moments.mean), np.array(moments.std)
+    if not 0.5 <= np.median(std) <= 1.5:
+        return False
+    if not space.mean:
+        return bool(np.abs(mean).max() <= 0.5)
+    own_mean, own_std = np.array(space.mean), np.array(space.std)
+    as_encoded = -0.5 * ((mean - own_mean) ** 2 + std**2) / own_std**2 - np.log(own_std)
+    standard = -0.5 * (mean**2 + std**2)
+    return bool((standard - as_encoded).sum() > 0)
+
+
+def tell_alone(moments: LatentMoments, space: LatentSpace) -> bool:
+    """Whether the moments of one asset tell if its latents have been standardised.
+
+    An asset's channels spread less than the dataset's, so standardised latents of one may look as
+    if they were not. Those of a wide spread are as encoded, and those that look standardised are.
+    """
+    spread = float(np.median(moments.std))
+    return spread > _WIDE_ALONE or (bool(space.mean) and look_standardised(moments, space))
+
+
+def in_words(moments: LatentMoments) -> str:
+    """Return the spread and the mean of channels in a few words."""
+    mean, std = np.abs(moments.mean).max(), moments.std
+    return f"means within {mean:.2g} of 0, standard deviations {min(std):.2g} to {max(std):.2g}"
+
+
+def pooled_moments(known: Sequence[tuple[int, LatentMoments]]) -> LatentMoments:
+    """Return the moments of several assets together, each with its number of voxels."""
+    counts = np.array([count for count, _ in known], dtype=np.float64)
+    share: NDArray[np.float64] = (counts / counts.sum())[:, None]
+    means, stds = (np.array([getattr(one, n) for _, one in known]) for n in ("mean", "std"))
+    mean = (share * means).sum(axis=0)
+    variance = (share * (stds**2 + (means - mean) ** 2)).sum(axis=0)
+    return LatentMoments(tuple(mean.tolist()), tuple(np.sqrt(variance).tolist()))

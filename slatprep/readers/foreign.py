@@ -21,7 +21,7 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
 from slatprep.records.sources import ROLES
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 
 _MOST_LETTERS, _MOST_COUNT, _MOST_TOLD = 4096, 2**53, 1000
 """What a record takes of a text, the largest number that every reader of JSON keeps, and what an

@@ -23,6 +23,7 @@ from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, load_source, refusing
 from slatprep.readers.patterns import match
 from slatprep.records import Place, SourceFile
+from slatprep.storage.chunks import place_chunk
 from slatprep.storage.place import storage_of
 from slatprep.storage.states import reading
 
@@ -220,12 +221,7 @@ def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
                 f"the chunk at {corner} is damaged: it does not unpack to {chunk_bytes} bytes",
                 "chunks of the size that the dataset states; copy or make the file again",
             )
-        block = np.frombuffer(data, dtype).reshape(steps)
-        region = tuple(
-            slice(start, min(start + step, n))
-            for start, step, n in zip(corner, steps, dataset.shape, strict=True)
-        )
-        array[region] = block[tuple(slice(part.stop - part.start) for part in region)]
+        place_chunk(array, corner, np.frombuffer(data, dtype).reshape(steps))
     return array
 
 

@@ -15,14 +15,13 @@ from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import adapters
 from slatprep.readers.contents import contents_of
-from slatprep.readers.joins import read_categories, read_map
+from slatprep.readers.joins import by_case, read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.published import category_of, hint_of, locate_grids
 from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
-from slatprep.readers.unmatched import by_case
 from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.archives import is_archive
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 from slatprep.storage.place import storage_of
 
 

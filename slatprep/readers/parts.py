@@ -24,7 +24,7 @@ from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patt
 from slatprep.readers.files import load_source, require_complete
 from slatprep.readers.voxel_sets import field_of_voxels
 from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 
 _KEYS: dict[str, tuple[str, float, dict[str, float]]] = {
     "youngs_modulus": ("Young's Modulus (GPa)", 1e9, {"gpa": 1e9}),

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from slatprep.errors import ConfigError
 from slatprep.records import Place
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 from slatprep.storage.place import storage_of
 
 FIELDS = ("id", "sample", "view")

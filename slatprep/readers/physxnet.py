@@ -23,7 +23,7 @@ from slatprep.readers.files import ArraySpec, load_source, npy_array, require_co
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import field_of_voxels
 from slatprep.records import PROPERTIES, AssetPair, MaterialField
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 
 _ROWS = ArraySpec(shapes=((None, 14),), kinds="f", note=", as PhysX-3D's toolkit writes it")
 _DENSITY = 2

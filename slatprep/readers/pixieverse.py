@@ -33,7 +33,7 @@ from slatprep.records import (
     Place,
     SourceFile,
 )
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 
 _CUBE = (RESOLUTION,) * 3
 _RAW_SHAPE = (*_CUBE, 4)

@@ -16,8 +16,7 @@ from slatprep.readers.adapters import source_adapter
 from slatprep.readers.patterns import fill
 from slatprep.records import AssetPair, Place
 from slatprep.storage.archives import is_archive, shown
-from slatprep.storage.fetch import fetch
-from slatprep.storage.members import ArchivePlace, ArchiveTree
+from slatprep.storage.members import ArchivePlace, ArchiveTree, fetch
 from slatprep.storage.place import storage_of
 
 GRIDS, ARCHIVES = "render_outputs", "archives"

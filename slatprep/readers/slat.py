@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import SlatSource
-from slatprep.readers.encoders import ENOUGH, in_words, look_standardised
+from slatprep.readers.contents import ENOUGH, in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
 from slatprep.records import RESOLUTION, TRELLIS, LatentSpace, Place, SourceFile, StructuredLatents

@@ -13,8 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.readers.mistakes import mistakes_of
-from slatprep.readers.plausible import TOLD, Part, beyond_all, fault_of, is_physical, oddity_of
+from slatprep.readers.plausible import (
+    TOLD,
+    Part,
+    beyond_all,
+    fault_of,
+    is_physical,
+    mistakes_of,
+    oddity_of,
+)
 from slatprep.records import (
     BACKGROUND,
     FACTORS,

@@ -12,7 +12,7 @@ from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patt
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, require_complete
 from slatprep.readers.voxel_sets import field_of_voxels
 from slatprep.records import PROPERTIES, AssetPair, MaterialField
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 
 _VOXELS = {"voxel_data": ArraySpec(shapes=((None,),), kinds="V")}
 _SIDE = 64

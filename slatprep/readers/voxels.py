@@ -27,7 +27,7 @@ from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
 from slatprep.readers.zarr_groups import group_arrays
 from slatprep.storage.documents import read_bounded
-from slatprep.storage.listing import Listing
+from slatprep.storage.files import Listing
 
 DESCRIPTION = "source.json"
 _MAX_BYTES = 2**16

@@ -22,13 +22,12 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from slatprep.errors import InputError
-from slatprep.storage.ahead import ReadAhead
 from slatprep.storage.atomic import staged_apart
 from slatprep.storage.cache import cache_folder, short
 from slatprep.storage.files import LocalFile, open_digest, open_regular
 from slatprep.storage.remote import RemoteFile, RemotePlace
 from slatprep.storage.states import boot_id, lasting_state
-from slatprep.storage.tar import BLOCK, ArchiveError, Entry, entries, unpack
+from slatprep.storage.tar import BLOCK, ArchiveError, Entry, ReadAhead, entries, unpack
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -36,10 +35,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".tar", ".tar.gz", ".tgz")
 """How the names of archives end."""
 
-_FORMAT, _INDEX = 2, "index.z"
-
-_KEPT = ("next", "complete", "fault", "strange", "twice", "wanted")
-"""What is kept of an index besides its members."""
+_FORMAT, _INDEX = 3, "index.z"
 
 _STREAMED = 2**23
 """Bytes that an archive with gzip is read by."""
@@ -314,9 +310,7 @@ def _extend(
 
 
 def _write_index(archive: Archive, index: Index) -> None:
-    document = {"format": _FORMAT} | {name: getattr(index, name) for name in _KEPT}
-    document["members"] = [tuple(entry) for entry in index.members.values()]
-    text = orjson.dumps(document, default=str)
+    text = orjson.dumps({"format": _FORMAT, "index": index}, default=tuple)
     with staged_apart(archive.folder / _INDEX, archive.folder) as partial:
         partial.write_bytes(zlib.compress(text, 1))
 
@@ -325,15 +319,13 @@ def _read_index(archive: Archive) -> Index:
     """Return what is known of an archive's members."""
     try:
         document = orjson.loads(zlib.decompress((archive.folder / _INDEX).read_bytes()))
-        if document["format"] != _FORMAT:
-            return Index()
-        members = [Entry(*entry) for entry in document["members"]]
-        kept = {name: document[name] for name in _KEPT}
-        if kept["wanted"] not in ([], list(archive.wanted)):
-            return Index()
-    except (OSError, ValueError, TypeError, LookupError, zlib.error):
-        return Index()  # It is made anew.
-    return Index({entry.name: entry for entry in members}, **kept)
+        index = Index(**document["index"])
+        index.members = {name: Entry(*entry) for name, entry in index.members.items()}
+        if document["format"] == _FORMAT and index.wanted in ([], list(archive.wanted)):
+            return index
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, zlib.error):
+        pass
+    return Index()  # It is made anew.
 
 
 def shown(place: Place) -> str:

@@ -1,4 +1,8 @@
-"""Files of the local disk: reading by ranges, listing, and digests."""
+"""Files of the local disk: reading by ranges, listing, digests, and names for them.
+
+A disk is asked for names one by one. An object store has no folders: it lists a thousand names in a
+request, and asking for a single name costs as much.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,13 @@ import os
 import shutil
 import stat
 import sys
+from collections.abc import Iterable
 from contextlib import suppress
+from functools import cached_property
 from io import BufferedWriter, BytesIO, FileIO
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, cast
+from urllib.parse import quote
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -187,3 +194,104 @@ def file_digest(place: Place) -> str:
 def open_digest(file: IO[bytes] | LocalFile) -> str:
     """Return the SHA-256 of an open file that has not been read, in hex."""
     return hashlib.file_digest(cast(BytesIO, file), "sha256").hexdigest()
+
+
+class Listing:
+    """Names below a folder of the local disk, up to date except that each folder is listed once.
+
+    Names are relative to the folder, with forward slashes.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = str(root)  # os.path.join is not called so often with a Path
+
+    def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
+        """Return the names of a folder's files, or of its folders; none if it does not exist.
+
+        `folder` ends with a slash, or is empty for the root. OSError if it cannot be listed.
+        """
+        return (self._scan(folder) if folder else self._top)[folders]
+
+    def is_file(self, path: str) -> bool:
+        """Whether this name exists and is not a folder; broken links count."""
+        full = os.path.join(self._root, path)  # noqa: PTH118 - half a million times
+        link = False
+        try:
+            mode = os.lstat(full).st_mode
+            if link := stat.S_ISLNK(mode):
+                mode = os.stat(full).st_mode  # noqa: PTH116
+        except (OSError, ValueError):
+            return link
+        return not stat.S_ISDIR(mode)
+
+    @cached_property
+    def _top(self) -> tuple[list[str], list[str]]:
+        return self._scan("")  # Every pattern begins there.
+
+    def _scan(self, folder: str) -> tuple[list[str], list[str]]:
+        """Return the names in a folder: of files and others, and of folders."""
+        found: tuple[list[str], list[str]] = ([], [])
+        try:
+            with os.scandir(os.path.join(self._root, folder)) as entries:  # noqa: PTH118
+                for entry in entries:
+                    found[_is_folder(entry)].append(entry.name)
+        except (FileNotFoundError, NotADirectoryError):
+            pass
+        return found
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # A link loop.
+        return False
+
+
+class RemoteListing(Listing):
+    """Names below a place on an object store when it was listed, relative to the root."""
+
+    def __init__(self, files: Iterable[str]) -> None:
+        self.files = frozenset(files)
+        self._folders: dict[str, dict[str, None]] = {}
+        for file in self.files:
+            while file:
+                folder, _, name = file.rpartition("/")
+                self._folders.setdefault(folder + "/" if folder else "", {})[name] = None
+                file = folder
+
+    def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
+        """See `Listing`."""
+        names = self._folders.get(folder, ())
+        if folders:
+            return [name for name in names if f"{folder}{name}/" in self._folders]
+        return [name for name in names if folder + name in self.files]
+
+    def is_file(self, path: str) -> bool:
+        """See `Listing`."""
+        return path in self.files
+
+
+_LONGEST_NAME = 180
+
+
+def file_name(asset_id: str, *, dots: bool = True) -> str:
+    """Return a file name for an asset of any id, without suffix.
+
+    Plain ids stay unchanged. Characters that mean something to a shell, an archive or a file system
+    are percent-encoded, as are a leading sign and, without `dots`, dots. Names that would be too
+    long end in a hash.
+
+    >>> file_name("0a1b2c.front"), file_name("0a1b2c.front", dots=False)
+    ('0a1b2c.front', '0a1b2c%2Efront')
+    >>> file_name("../a b"), file_name("-rf")
+    ('%2E.%2Fa%20b', '%2Drf')
+    """
+    name = quote(asset_id, safe="") or "%"
+    if not dots:
+        name = name.replace(".", "%2E")
+    if name.startswith((".", "_", "-", "~")):
+        name = f"%{ord(name[0]):02X}{name[1:]}"
+    if len(name) > _LONGEST_NAME:
+        digest = hashlib.sha256(asset_id.encode()).hexdigest()[:32]
+        name = f"{name[:_LONGEST_NAME]}~{digest}"
+    return name

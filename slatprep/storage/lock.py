@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import stat
@@ -11,8 +10,9 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 
+import orjson
+
 from slatprep.errors import StoreError
-from slatprep.storage.documents import parse_document
 from slatprep.storage.files import OWN_FILE, is_at, locks_alone
 
 _TRIES = 100
@@ -69,13 +69,13 @@ def _sign(descriptor: int, path: Path) -> None:
         "host": platform.node(),
         "since": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    os.pwrite(descriptor, json.dumps(told).encode(), 0)
+    os.pwrite(descriptor, orjson.dumps(told), 0)
 
 
 def _holder(descriptor: int) -> str:
     """Return the process that a lock names as its holder, or ""."""
     try:
-        told = parse_document(os.pread(descriptor, 4096, 0))
+        told = orjson.loads(os.pread(descriptor, 4096, 0))
         return f"process {told['pid']} on {told['host']}, since {told['since']}"
-    except (ValueError, KeyError, OSError):
+    except (ValueError, TypeError, LookupError, OSError):
         return ""

@@ -22,8 +22,14 @@ from slatprep.errors import InputError, StoreError
 from slatprep.storage.archives import Archive
 from slatprep.storage.atomic import staged
 from slatprep.storage.cache import cached_file, copied_version, folder_for
-from slatprep.storage.files import LocalFile, LocalFolder, local_files, open_regular
-from slatprep.storage.listing import Listing, RemoteListing
+from slatprep.storage.files import (
+    Listing,
+    LocalFile,
+    LocalFolder,
+    RemoteListing,
+    local_files,
+    open_regular,
+)
 from slatprep.storage.members import ArchivePlace
 from slatprep.storage.remote import (
     RemoteFile,

@@ -37,6 +37,16 @@ class PlaceByText:
     def __hash__(self) -> int:
         return hash(str(self))
 
+    @property
+    def name(self) -> str:
+        """Its last component."""
+        return PurePosixPath(str(self)).name
+
+    @property
+    def suffix(self) -> str:
+        """The extension of its name, with the dot."""
+        return PurePosixPath(str(self)).suffix
+
     def absolute(self) -> Self:
         """Return the same."""
         return self
@@ -77,16 +87,6 @@ class RemotePlace(PlaceByText):
 
     def __str__(self) -> str:
         return f"{self.protocol}://{'/'.join(self.path.parts)}"
-
-    @property
-    def name(self) -> str:
-        """Its last component."""
-        return self.path.name
-
-    @property
-    def suffix(self) -> str:
-        """The extension of its name, with the dot."""
-        return self.path.suffix
 
     @property
     def parent(self) -> RemotePlace:

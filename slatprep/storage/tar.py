@@ -1,17 +1,166 @@
-"""The members of tar archives: where they lie, found by reading headers alone."""
+"""The members of tar archives: where they lie, found by reading headers alone.
+
+They are read with as few requests and as few bytes as may be. A walk writes the files of a folder
+one after another: what lies between two of them lies in that folder. So the files of a folder that
+nobody asks for are leaped over: a later header of it is sought, about where the last such folder
+had its last ones.
+"""
 
 from __future__ import annotations
 
 import gzip
+import io
 import tarfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import IO, NamedTuple
+from typing import IO, NamedTuple, Protocol
 
-from slatprep.storage.ahead import ReadAhead
-from slatprep.storage.leaps import Leaps
-from slatprep.storage.names import plain_name
+
+class Ranges(Protocol):
+    """What is read by ranges: `slatprep.storage.place.RangeFile` is one."""
+
+    def pread(self, length: int, offset: int) -> bytes:
+        """Read up to `length` bytes from an offset on."""
+
+
+MAX_READ = 2**20
+"""Most that one read may ask for: what a header claims is not believed."""
+
+_LEAST, _MOST, _NEAR = 2**13, 2**22, 2**21
+"""Bytes: a request after a jump; the largest request; a gap that costs less than a request."""
+
+_SHARE, _SLACK = 0.015, 2**22
+"""Requests grow as long as no more than this share of what lies before was read, and so much."""
+
+
+class ReadAhead(io.RawIOBase):
+    """A file object over ranges, for reading headers that lie between members of any size.
+
+    After a jump it asks for little. As long as the next headers are near, each request is twice
+    the last one: many small members come with one request, and large ones are passed over.
+    Of a file that is not `remote` all requests are small.
+    """
+
+    def __init__(self, file: Ranges, remote: bool) -> None:
+        super().__init__()
+        self._file, self._most = file, _MOST if remote else _LEAST
+        self._begin, self._data, self._at = 0, b"", 0
+        self._window, self._spent, self._allowed = _LEAST, 0, 0
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Set the position, counted from the beginning."""
+        if whence != io.SEEK_SET:
+            raise io.UnsupportedOperation("seek from elsewhere than the beginning")
+        self._at = offset
+        return offset
+
+    def read(self, length: int = -1) -> bytes:
+        """Read on; fewer bytes than asked for mean the end. ValueError above `MAX_READ`."""
+        if not 0 <= length <= MAX_READ:
+            raise ValueError(f"a header claims {length} bytes")
+        data = self.held(length, self._at)
+        self._at += len(data)
+        return data
+
+    def holds(self, length: int, offset: int) -> bool:
+        """Whether a range was read already."""
+        return self._begin <= offset and offset + length <= self._begin + len(self._data)
+
+    def affords(self, length: int) -> bool:
+        """Whether so much may be read at once; growing requests leave half for it."""
+        return self._spent + length <= self._allowed
+
+    def held(self, length: int, offset: int) -> bytes:
+        """Return a range, from what was read already if it can be."""
+        end = self._begin + len(self._data)
+        if not self.holds(length, offset):
+            near = 0 <= offset - end <= _NEAR or self._begin <= offset < end
+            self._window = min(2 * self._window, self._most) if near else _LEAST
+            self._allowed = int(_SHARE * offset) + _SLACK
+            window = min(self._window, max(_LEAST, self._allowed // 2 - self._spent))
+            self._begin, self._data = offset, self._file.pread(max(length, window), offset)
+            self._spent += len(self._data)
+        start = offset - self._begin
+        return self._data[start : start + length]
+
+
+_MAGIC_AT = 257
+
+_NARROWEST, _WIDEST = 2**14, 2**19
+"""Bytes that are read to find a header."""
+
+_FIRST, _WIDER = 3, 8
+"""Files that tell how large the next ones are; so many of these are leaped over first."""
+
+_FARTHEST = 2**27
+"""Bytes: no leap is wider, so that none leads into another copy of the folder."""
+
+
+class Leaps:
+    """What is known of the folders that were passed, for leaping within the next ones."""
+
+    def __init__(self, file: ReadAhead) -> None:
+        self._file = file
+        self._landed: dict[str, int] = {}
+        self._folder, self._first = "", 0
+        self._files, self._bytes, self._reach, self._beyond = 0, 0, 0, 0
+
+    def after(self, folder: str, data: int, end: int) -> int:
+        """Return where to read on after a file of a folder: at `end`, or at a later header of it.
+
+        `data` is where the file's content begins.
+        """
+        other = folder != self._folder
+        if other:
+            self._folder, self._first = folder, data
+        if other or 0 < self._beyond <= end:  # It was within a larger file.
+            self._files = self._bytes = self._reach = self._beyond = 0
+        self._files, self._bytes = self._files + 1, self._bytes + end - data
+        size, name = self._bytes // self._files, folder.rpartition("/")[2]
+        window = min(max(2 * size, _NARROWEST), _WIDEST)
+        expected = self._first + self._landed.get(name, 0)
+        while not self._file.holds(BLOCK, end) and self._file.affords(2 * window):
+            if self._beyond:
+                leap = (self._beyond - end) * (7 if expected > end else 4) // 8
+            elif expected > end:
+                leap = expected - end - window // 2
+            elif self._files >= _FIRST:
+                leap = self._reach = 2 * self._reach or _WIDER * size
+            else:
+                break
+            leap = min(leap, _FARTHEST) // BLOCK * BLOCK
+            if leap < window:
+                self._file.held(2 * window, end - BLOCK)
+                break
+            found = self._sought(end + leap, window)
+            if found:
+                self._landed[name] = found - self._first
+                return found
+            self._beyond = end + leap
+        return end
+
+    def _sought(self, at: int, window: int) -> int:
+        """Return where a header of the folder lies in a window; 0 where none does."""
+        data, found = self._file.held(window, at), -1
+        while (found := data.find(b"ustar", found + 1)) >= 0:
+            begin = found - _MAGIC_AT
+            if begin <= 0 or begin % BLOCK:
+                continue
+            try:
+                member = tarfile.TarInfo.frombuf(
+                    data[begin : begin + BLOCK], "utf-8", "surrogateescape"
+                )
+            except tarfile.HeaderError:
+                continue
+            if plain_name(member.name).rpartition("/")[0] == self._folder:
+                return at + begin
+        return 0
+
 
 BLOCK = tarfile.BLOCKSIZE
 """Bytes of a header, to a multiple of which members are filled up."""
@@ -124,3 +273,11 @@ def _told(fault: str = "is no intact tar archive") -> Iterator[None]:
     except (tarfile.TarError, EOFError, ValueError, zlib.error, gzip.BadGzipFile) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ArchiveError(f"{fault} ({reason}); {INCOMPLETE}") from None
+
+
+def plain_name(name: str) -> str:
+    """Return the name of a member as a path below a folder; empty if it could be none."""
+    parts = [part for part in name.split("/") if part not in ("", ".")]
+    if name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
+        return ""
+    return "/".join(parts)

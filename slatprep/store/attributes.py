@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 import orjson
 from annotated_types import MaxLen, MinLen
@@ -15,9 +14,7 @@ from slatprep import records
 from slatprep.parameters import Length, SampleParameters
 from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT, FORMAT_VERSION
-
-if TYPE_CHECKING:
-    from pydantic import TypeAdapter
+from slatprep.store.record_json import adapter_of
 
 
 def _one_of(*values: object) -> records.InJson:
@@ -73,7 +70,7 @@ class StoredBuild:
 class RootAttributes:
     """What readers rely on; attributes that they do not know are left alone.
 
-    `root_attributes` makes them.
+    `slatprep.store.writer.finish_store` writes them.
     """
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "ignore", "allow_inf_nan": False}
@@ -121,8 +118,8 @@ def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Fin
     from pydantic import ValidationError
 
     try:
-        read: RootAttributes = _adapter().validate_json(orjson.dumps(attributes), strict=True)
-        return read
+        read = adapter_of(RootAttributes).validate_json(orjson.dumps(attributes), strict=True)
+        return cast(RootAttributes, read)
     except ValidationError as error:
         return tuple(
             Finding(
@@ -157,25 +154,10 @@ def segments_of(ids: Sequence[str]) -> list[int]:
     return [0, *(row for row, (one, other) in enumerate(pairwise(ids), 1) if one > other)]
 
 
-def root_attributes(
-    normalization: records.Normalization,
-    manifest: str,
-    build: Mapping[str, object],
-    contents: records.Contents,
-    ids: Sequence[str],
-) -> dict[str, Any]:
-    """Return the attributes of the store's root: `store_attributes`, and what its rows tell."""
-    return {
-        **store_attributes(normalization, build, contents),
-        "manifest": manifest,
-        "segments": segments_of(ids),
-    }
-
-
 def store_attributes(
     normalization: records.Normalization, build: Mapping[str, object], contents: records.Contents
 ) -> dict[str, Any]:
-    """Return the attributes of a store's root that decide its bytes, whatever its rows.
+    """Return the attributes of a store's root that decide its bytes, but for what its rows tell.
 
     `build` holds the parameters and versions that made the content, so that
     a store is understood without its manifests.
@@ -203,11 +185,3 @@ _FAULTS = 64
 
 def _shown(fault: Mapping[str, Any]) -> str:
     return "missing" if fault["type"] == "missing" else repr(fault["input"])[:100]
-
-
-@cache
-def _adapter() -> TypeAdapter[Any]:
-    # Late: pydantic takes a third of a second that commands without a store do not have.
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(RootAttributes)

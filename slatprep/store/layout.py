@@ -169,7 +169,7 @@ FILES = (
     ArrayLayout(f"{FILE}/size", "int64", ("file",), 0, "bytes"),
     ArrayLayout(f"{FILE}/sha256", "str", ("file",), "", "SHA-256 in hex"),
 )
-"""Digests of the store's files; see `slatprep.store.digests`."""
+"""Digests of the store's files; see `slatprep.store.integrity`."""
 
 LAYOUTS = {layout.name: layout for layout in (*ARRAYS, *MERGED, RECORDS, *FILES)}
 """Every array that a store may have, by name, but for the coordinates of its dimensions."""

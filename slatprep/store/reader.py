@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import pkgutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -368,22 +370,23 @@ def _require_readable(path: Place) -> None:
     """Raise StoreError if there is nothing at all, or it may not be read."""
     needed = path / "zarr.json"
     try:
-        there = needed.exists()
+        if needed.exists():
+            with suppress(FileNotFoundError):
+                storage_of(needed).read(0)
+            return
     except PermissionError as error:
-        raise _unreadable(needed, error) from None
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
-    try:
-        storage_of(needed).read(0)
-    except PermissionError as error:
-        raise _unreadable(needed, error) from None
-    except OSError:
-        pass  # A pipe or a folder of that name is no store.
-    if not there:
         raise StoreError(
-            f"{path} is not a slatprep store: {needed} does not exist; build a store with "
-            "`slatprep build-store`"
-        )
+            f"{needed}: may not be read ({error.strerror}); expected a store that these "
+            "credentials may read"
+        ) from None
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.EISDIR):
+            return  # A pipe or a folder of that name is no store.
+        raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
+    raise StoreError(
+        f"{path} is not a slatprep store: {needed} does not exist; build a store with "
+        "`slatprep build-store`"
+    )
 
 
 def _root_document(path: Place) -> dict[str, Any]:
@@ -392,10 +395,3 @@ def _root_document(path: Place) -> dict[str, Any]:
     except StoreError:
         return {}
     return document if isinstance(document.get("attributes"), dict) else {}
-
-
-def _unreadable(needed: Place, error: PermissionError) -> StoreError:
-    return StoreError(
-        f"{needed}: may not be read ({error.strerror}); expected a store that these credentials "
-        "may read"
-    )

@@ -1,11 +1,18 @@
-"""Records as JSON: written, and read with bounds, in this one place."""
+"""Records as JSON, written and read with bounds, and as columns, in this one place.
+
+    python -m slatprep.store.record_json
+
+writes their JSON Schemas into ``slatprep/store/schema``, where they are published.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable
 from dataclasses import fields
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -14,11 +21,12 @@ import orjson
 from slatprep.errors import StoreError
 from slatprep.records import SourceFile, Status
 from slatprep.storage.place import is_place
-from slatprep.store.layout import MAX_RECORD_BYTES
+from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES
 from slatprep.store.record import AssetRecord, BuildRecord, Record
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
+
 
 _FAULTS = 64
 
@@ -142,3 +150,48 @@ def _plain(value: object) -> Any:
     if is_place(value):
         return str(value)
     raise TypeError(f"a record cannot hold {type(value).__name__} {value!r}")
+
+
+def columns_of(record: AssetRecord) -> dict[str, Any]:
+    """Return an asset's row of each ``asset/*`` array that its record tells, by its last name.
+
+    An array of `slatprep.store.layout.ARRAYS` that has the name of an entry takes its value.
+    ``property_ambiguity`` is in mapped units: ranges come from the dataset.
+    """
+    alignment, judgement, counts = record.alignment, record.judgement, record.counts
+    parts = (counts, alignment.quality, judgement, alignment, record)
+    entries = {name: value for part in parts for name, value in vars(part).items()}
+    moments = record.latents
+    entries |= {
+        "ambiguity": judgement.ambiguity.material_share,
+        "property_ambiguity": judgement.ambiguity.property_change,
+        "valid_share": counts.valid / counts.slat_voxels,
+        "merged": bool(record.merged),
+        "key": np.frombuffer(bytes.fromhex(record.of_first_pass().key), np.uint8),
+        "latent_mean": np.nan if moments is None else moments.mean,
+        "latent_std": np.nan if moments is None else moments.std,
+    }
+    names = (layout.name.removeprefix("asset/") for layout in ARRAYS)
+    return {name: entries[name] for name in names if name in entries}
+
+
+FOLDER = Path(__file__).with_name("schema")
+
+
+def json_schemas() -> dict[str, dict[str, Any]]:
+    """Return the JSON Schema (draft 2020-12) of each kind of record, by its file's name."""
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    adapters = {
+        "asset_record.schema.json": ("slatprep asset record", adapter_of(Record)),
+        "build_record.schema.json": ("slatprep build record", adapter_of(BuildRecord)),
+    }
+    schemas: dict[str, dict[str, Any]] = {}
+    for name, (title, adapter) in adapters.items():
+        schema = {"$schema": dialect, **adapter.json_schema(), "title": title}
+        schemas[name] = json.loads(json.dumps(schema))  # Defaults may be tuples.
+    return schemas
+
+
+if __name__ == "__main__":
+    for name, schema in json_schemas().items():
+        (FOLDER / name).write_text(json.dumps(schema, indent=2) + "\n", encoding="utf-8")

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.parameters import MAX_SHARD_CHUNKS
 from slatprep.records import MAX_NAME_BYTES
-from slatprep.storage.chunks import whole_sizes
-from slatprep.storage.codecs import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds
+from slatprep.storage.chunks import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds, whole_sizes
 from slatprep.storage.place import Folder, RangeFile
 from slatprep.store.layout import MAX_RECORD_BYTES, RECORD_ARRAY
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slatprep.records import Place
 from slatprep.storage.atomic import staged_apart, writing
-from slatprep.storage.codecs import single_threaded_blosc
+from slatprep.storage.chunks import single_threaded_blosc
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import read_metadata
 from slatprep.store.shard_reader import MISSING, RowReader

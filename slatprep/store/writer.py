@@ -20,9 +20,9 @@ from slatprep.geometry.frames import voxel_centres
 from slatprep.parameters import StoreParameters
 from slatprep.records import PIXIEVERSE, RESOLUTION, Contents, Normalization, Place
 from slatprep.store import layout
-from slatprep.store.attributes import root_attributes
+from slatprep.store.attributes import segments_of, store_attributes
 from slatprep.store.contract import read_metadata
-from slatprep.store.digests import add_array, write_digests
+from slatprep.store.integrity import add_array, write_digests
 from slatprep.store.runs import Piece, Runs
 
 GROUPS = ("voxel", "grid", "record")
@@ -83,18 +83,12 @@ def create_store(
         "latent": contents.latents.channels,
         **layout.FIXED_SIZES,
     }
-    chunk_and_shard = {
-        "asset": (layout.ASSET_CHUNK, None),
-        "voxel": (parameters.voxel_chunk, layout.rows_per_shard(parameters, n_voxels)),
-        "grid": (1, parameters.grid_assets_per_shard),
-        layout.RECORD_ARRAY: (layout.RECORDS_IN_CHUNK, layout.RECORDS_IN_SHARD),
-    }
+    cuts = cuts_of(parameters, n_voxels)
     for array in (*layout.arrays_with(merged), layout.RECORDS):
         shape = tuple(sizes[dimension] for dimension in array.dimensions)
         group = array.name.partition("/")[0]
-        chunk, shard = chunk_and_shard.get(array.name, chunk_and_shard[group])
-        if shard is None:
-            chunk = min(chunk, shape[0])
+        group = "record" if array is layout.RECORDS else group
+        chunk, shard = cuts.get(group, (min(layout.ASSET_CHUNK, shape[0]), None))
         attributes: dict[str, Any] = {"description": array.description}
         if array.unit:
             attributes["units"] = array.unit
@@ -138,12 +132,12 @@ def packing_of(array: Place) -> object:
     return data_type, fill_value, inner.get("chunk_shape"), inner.get("codecs")
 
 
-def shard_rows(parameters: StoreParameters, n_voxels: int) -> dict[str, int]:
-    """Return how many rows one shard of each group holds."""
+def cuts_of(parameters: StoreParameters, n_voxels: int) -> dict[str, tuple[int, int]]:
+    """Return how many rows one chunk, and one shard, of each group holds."""
     return {
-        "voxel": layout.rows_per_shard(parameters, n_voxels),
-        "grid": parameters.grid_assets_per_shard,
-        "record": layout.RECORDS_IN_SHARD,
+        "voxel": (parameters.voxel_chunk, layout.rows_per_shard(parameters, n_voxels)),
+        "grid": (1, parameters.grid_assets_per_shard),
+        "record": (layout.RECORDS_IN_CHUNK, layout.RECORDS_IN_SHARD),
     }
 
 
@@ -159,13 +153,12 @@ def shards(
     `rows` say where the arrays of each asset lie, `runs` by group which rows older stores have in
     chunks of the same bytes, and `taken` which shards, by group and number, are left out.
     """
-    chunks = {"voxel": parameters.voxel_chunk, "grid": 1, "record": layout.RECORDS_IN_CHUNK}
-    for group, per_shard in shard_rows(parameters, offsets[-1]).items():
+    for group, (chunk, per_shard) in cuts_of(parameters, offsets[-1]).items():
         own, total = runs.get(group, Runs()), offsets[-1] if group == "voxel" else len(rows)
         for number, (start, stop) in enumerate(layout.row_ranges(total, per_shard)):
             if (group, number) in taken:
                 continue
-            pieces = tuple(own.pieces(start, stop, chunks[group]))
+            pieces = tuple(own.pieces(start, stop, chunk))
             first, last = start, stop
             begins: Sequence[int] = ()
             if group == "voxel":
@@ -193,7 +186,8 @@ def finish_store(
 
     root = open_for_writing(path)
     ids = root["asset/id"][:]
-    root.attrs.update(root_attributes(normalization, build_id, build, contents, ids))
+    rows = {"manifest": build_id, "segments": segments_of(ids)}
+    root.attrs.update(store_attributes(normalization, build, contents) | rows)
     _write_coordinates(root, [one.name for one in contents.properties])
     write_digests(path, known, elsewhere)
     with warnings.catch_warnings():

@@ -23,7 +23,7 @@ from slatprep.export.target import directory
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
 from slatprep.readers.splits import Shares, split_objects
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.store import Store
 
 # What an asset's points may be: material id to E, density, nu.

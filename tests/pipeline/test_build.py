@@ -11,7 +11,7 @@ from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreE
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import align_pairs, build_store
 from slatprep.store import open_store
-from slatprep.store.manifests import manifests_of
+from slatprep.store.records import manifests_of
 
 
 def test_bad_assets_are_told_and_the_others_go_in(mixed_build):

@@ -9,7 +9,7 @@ from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.decoys import FILE, measured_errors, told_of
 from slatprep.store import open_store
-from slatprep.store.manifests import manifests_of
+from slatprep.store.records import manifests_of
 
 OBJECTS = ("ant", "bear", "cup", "dog", "eel", "fox")
 

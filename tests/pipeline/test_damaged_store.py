@@ -14,7 +14,7 @@ from support.trees import tree
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
 from slatprep.store import open_store
-from slatprep.store.digests import write_digests
+from slatprep.store.integrity import write_digests
 from slatprep.store.layout import FILE
 from slatprep.store.records import StoredRecords
 

@@ -20,9 +20,8 @@ from slatprep.particles.transfer import transfer
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 from slatprep.store.reader import Store
-from slatprep.store.record_json import read_asset_record, to_json
+from slatprep.store.record_json import FOLDER, read_asset_record, to_json
 from slatprep.store.records import StoredRecords
-from slatprep.store.schemas import FOLDER
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from slatprep.inspect.pictures.errors import draw_errors
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.pipeline.decoys import FILE, draw_decoys, measure_errors, measured_errors, told_of
 from slatprep.store import Store, open_store
-from slatprep.store.manifests import manifests_of
+from slatprep.store.records import manifests_of
 
 
 @pytest.fixture(scope="module")

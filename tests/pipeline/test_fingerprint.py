@@ -89,7 +89,7 @@ def test_what_makes_numbers_is_in_it_and_nothing_else():
     modules = numeric_modules()
     readers = {name.partition(":")[0] for name in [*SOURCES.values(), *LATENTS.values()]}
     merging = {f"slatprep.{name}" for name in ("pipeline.annotate", "storage.chunks")}
-    assert readers | merging | {"slatprep.storage.codecs"} <= modules.keys()
+    assert readers | merging | {"slatprep.storage.chunks"} <= modules.keys()
     others = ("slatprep.storage.pl", "slatprep.cli", "slatprep.store")
     assert not [name for name in modules if name.startswith((*others, "slatprep.pipeline.dataset"))]
     for path in modules.values():
@@ -98,7 +98,7 @@ def test_what_makes_numbers_is_in_it_and_nothing_else():
 
 def test_what_packs_rows_makes_columns_and_records_is_in_the_other(monkeypatch, tmp_path):
     """Code that is in no key, and still decides bytes."""
-    wanted = {"normalize", "pipeline.pack", "pipeline.recipe", "store.columns",
+    wanted = {"normalize", "pipeline.pack", "pipeline.recipe", "store.record_json",
               "store.shard_writer", "store.layout"}  # fmt: skip
     assert {f"slatprep.{name}" for name in wanted} <= set(fingerprint.PACKING)
     before = fingerprint.packing_fingerprint.__wrapped__()

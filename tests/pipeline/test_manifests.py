@@ -10,7 +10,7 @@ from support.trees import inodes, records_of
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline import previous
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.store import layout, manifests, open_store, records
+from slatprep.store import layout, open_store, records
 from slatprep.store.layout import ARRAYS
 
 pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
@@ -34,10 +34,10 @@ def test_a_build_through_a_link_leaves_the_records_where_the_store_lies(built, t
         dataset.add(f"new{seed}", seed)
         summary = build_store(dataset.parameters(), link)
         assert summary.records == lines
-        assert manifests.build_in(lines.parent).store == "s.zarr"
+        assert records.build_in(lines.parent).store == "s.zarr"
         for place in (real, *links[: seed + 1]):
             assert verify_store(place).ok
-            assert manifests.manifests_beside(place) == lines.parent
+            assert records.manifests_beside(place) == lines.parent
     assert not (tmp_path / "other.manifests").exists()
 
 
@@ -79,7 +79,7 @@ def test_an_update_writes_what_is_new_and_the_last_shards(built):
 @pytest.fixture
 def two_a_shard(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut records into shards of two rows."""
-    for module in (layout, manifests, previous):
+    for module in (layout, records, previous):
         monkeypatch.setattr(module, "RECORDS_IN_SHARD", 2)
     for module in (layout, records):
         monkeypatch.setattr(module, "RECORDS_IN_CHUNK", 2)

@@ -10,7 +10,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents, read_slat
 from slatprep.readers.adapters import latent_adapter
-from slatprep.readers.encoders import latent_space, look_standardised, resolve_latents, tell_alone
+from slatprep.readers.contents import latent_space, look_standardised, resolve_latents, tell_alone
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
 
 

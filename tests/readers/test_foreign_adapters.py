@@ -13,7 +13,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import adapters, read_latents
 from slatprep.readers.adapters import FoundField, Holding, source_adapter
-from slatprep.readers.encoders import latent_space
+from slatprep.readers.contents import latent_space
 from slatprep.readers.foreign import guarded
 from slatprep.readers.pixieverse import PixieVerse
 from slatprep.records import PROPERTIES, TRELLIS, AssetPair

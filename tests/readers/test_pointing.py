@@ -10,7 +10,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover
 from slatprep.readers.files import require_complete
-from slatprep.readers.unmatched import explain_unmatched
+from slatprep.readers.joins import explain_unmatched
 from slatprep.storage.place import storage_of
 
 GRID = "{}/sample_0/material_grid.npy"

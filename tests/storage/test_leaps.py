@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 from support.published import SparseArchive
 
-from slatprep.storage.ahead import ReadAhead
 from slatprep.storage.archives import Archive
-from slatprep.storage.tar import entries
+from slatprep.storage.tar import ReadAhead, entries
 
 WANTED = ("*/sample_*/material_grid.npy", "*/clip_features_mask.npy", "*/clip_features.npz")
 ARCHIVE = Archive(Path("tree.tar"), "", 0, wanted=WANTED)

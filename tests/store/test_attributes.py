@@ -9,8 +9,8 @@ from slatprep.records import PIXIEVERSE, Contents, LatentSpace, Property
 from slatprep.store.attributes import (
     RootAttributes,
     read_attributes,
-    root_attributes,
     segments_of,
+    store_attributes,
     width_findings,
 )
 
@@ -177,6 +177,5 @@ def test_segments_begin_where_ids_begin_anew():
 def test_the_background_is_said_where_it_is_not_the_usual_one(classes, background):
     contents = Contents(PIXIEVERSE.properties, tuple(f"class {n}" for n in range(classes)))
     ranges = read(said()).ranges
-    attributes = root_attributes(ranges, BUILD_ID, {}, contents, ["b", "a"])
+    attributes = store_attributes(ranges, {}, contents)
     assert attributes.get("background") == background
-    assert attributes["segments"] == [0, 1]

@@ -21,7 +21,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, StoreParameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
-from slatprep.store.gate import gate_findings
+from slatprep.store.contract import gate_findings
 
 
 @pytest.fixture

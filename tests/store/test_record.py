@@ -11,13 +11,14 @@ from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 from slatprep.store.record import AssetRecord, FailedRecord
 from slatprep.store.record_json import (
+    FOLDER,
     RecordError,
+    json_schemas,
     read_asset_record,
     read_build_record,
     read_record,
     to_json,
 )
-from slatprep.store.schemas import FOLDER, json_schemas
 
 
 def lines_of(build: BuildSummary) -> list[bytes]:
@@ -51,7 +52,7 @@ def test_every_record_follows_the_published_schema(mixed_build):
 
 
 def test_the_published_schemas_are_those_of_the_classes():
-    """Made anew by ``python -m slatprep.store.schemas``."""
+    """Made anew by ``python -m slatprep.store.record_json``."""
     assert json_schemas() == {path.name: json.loads(path.read_text()) for path in FOLDER.iterdir()}
 
 

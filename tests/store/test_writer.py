@@ -12,7 +12,7 @@ import zarr
 from slatprep.errors import StoreError
 from slatprep.parameters import StoreParameters
 from slatprep.records import Normalization, PropertyRange
-from slatprep.store.digests import write_digests
+from slatprep.store.integrity import write_digests
 from slatprep.store.writer import Shard, create_store, finish_store, merges, shards
 
 

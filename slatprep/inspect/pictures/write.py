@@ -15,7 +15,7 @@ from slatprep.inspect.pictures.scene import Scene, scene_of
 from slatprep.inspect.pictures.sheet import MOST, draw_sheet
 from slatprep.records import Place
 from slatprep.storage.atomic import staged
-from slatprep.storage.names import file_name
+from slatprep.storage.files import file_name
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import StoredRecords
 from slatprep.workers import Progress

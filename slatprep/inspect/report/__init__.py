@@ -22,9 +22,8 @@ from slatprep.inspect.verify.index import WORDS
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
-from slatprep.store.manifests import build_in
 from slatprep.store.reader import Store, StoredAsset
-from slatprep.store.records import StoredRecords
+from slatprep.store.records import StoredRecords, build_in
 from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
 

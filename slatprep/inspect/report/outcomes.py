@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.records import Place, Status
-from slatprep.store.manifests import build_in
 from slatprep.store.reader import Store
 from slatprep.store.record import AssetRecord
-from slatprep.store.records import StoredRecords
+from slatprep.store.records import StoredRecords, build_in
 
 MOST_TIES = 8
 """Most tied placements of an asset on the page."""

@@ -19,8 +19,8 @@ from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import AttributesError
 from slatprep.store.contract import Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
-from slatprep.store.manifests import manifests_beside
 from slatprep.store.reader import Store, open_store
+from slatprep.store.records import manifests_beside
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 

@@ -31,12 +31,11 @@ from slatprep.records import (
 )
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
-from slatprep.store.columns import columns_of
 from slatprep.store.contract import Finding
 from slatprep.store.layout import RECORD_ARRAY
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.record import AssetRecord
-from slatprep.store.record_json import RecordError, digest_of
+from slatprep.store.record_json import RecordError, columns_of, digest_of
 from slatprep.store.records import StoredRecords
 from slatprep.store.shard_reader import DamagedFileError
 

@@ -18,10 +18,10 @@ from slatprep.records import Place, SourceRoots, Status
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.layout import RECORDS_IN_SHARD
-from slatprep.store.manifests import BUILD, build_in, build_text, file_names, lines_of
 from slatprep.store.reader import Store
 from slatprep.store.record import BuildRecord
 from slatprep.store.record_json import RecordError, read_build_record
+from slatprep.store.records import BUILD, build_in, build_text, file_names, lines_of
 
 _MOST_LINES = 8
 
