@@ -83,7 +83,9 @@ def test_what_is_no_file_has_no_state(on_a_disk, what):
     assert States().of(path.get(what, str(on_a_disk / what))) is None
 
 
-def test_a_file_that_was_written_just_now_has_no_lasting_state(on_a_disk):
+def test_a_file_that_was_written_just_now_has_no_lasting_state(on_a_disk, monkeypatch):
+    # However slow this machine is.
+    monkeypatch.setattr(states, "FINE_NS", 10**15)
     (on_a_disk / "a").write_bytes(b"content")
     assert lasting(on_a_disk / "a") is None
     assert States().of(str(on_a_disk / "a")) is not None

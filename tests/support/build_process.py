@@ -1,5 +1,6 @@
 """A build in a process of its own, with a fault in it, forked of one that has imported all."""
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -56,10 +57,11 @@ class Build:
         self._process.join()
 
     def kill_all(self) -> None:
-        """Kill it and its workers."""
-        while os.getpgid(self.pid) != self.pid:
-            time.sleep(0.01)
-        os.killpg(self.pid, signal.SIGKILL)
+        """Kill it and its workers, unless it has ended by itself."""
+        with contextlib.suppress(ProcessLookupError):
+            while os.getpgid(self.pid) != self.pid:
+                time.sleep(0.01)
+            os.killpg(self.pid, signal.SIGKILL)
         self._process.join()
 
     def done(self) -> "subprocess.CompletedProcess[str]":
