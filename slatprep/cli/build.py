@@ -1,4 +1,4 @@
-"""`slatprep build-store`, and `slatprep align`, which only aligns."""
+"""`slatprep build-store`, `align`, which only aligns, `subset` and `concat`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 _ASSETS_PER_JOB = 32
 """Assets that take the default engine as long as a worker takes to start, 1.6 s."""
-
-DAMAGES_LISTED = 10
-"""Most faults of an existing store that are printed; ``--json`` has all."""
 
 
 @command("build-store")
@@ -180,10 +177,8 @@ def _by_work(output: Output, parameters: BuildParameters) -> dict[str, Any]:
 
 def _show_damaged(output: Output, damaged: Sequence[str]) -> None:
     """Print the faults that were found in the existing store."""
-    for line in damaged[:DAMAGES_LISTED]:
-        output.problem(f"damaged, made anew: {line}")
-    if len(damaged) > DAMAGES_LISTED:
-        output.problem(f"and {len(damaged) - DAMAGES_LISTED:,} more: `slatprep verify` lists them")
+    lines = [f"damaged, made anew: {line}" for line in damaged]
+    output.problems(lines, "`slatprep verify` lists them")
 
 
 def _show_plan(output: Output, plan: BuildPlan) -> None:
@@ -233,9 +228,8 @@ def report(output: Output, summary: BuildSummary) -> None:
     def show() -> None:
         if summary.store is not None:
             from slatprep.inspect.overview import overview_of
-            from slatprep.store import open_store
 
-            store, built = open_store(summary.store), output.command == "build-store"
+            store, built = options.opened(summary.store), output.command == "build-store"
             # What a dataset definition may say is of no use to `subset` and `concat`.
             show_quality(output, overview_of(store), advise=built)
             show_errors(store)
@@ -249,3 +243,71 @@ def report(output: Output, summary: BuildSummary) -> None:
 
     verdicts = {str(verdict): summary.verdicts.get(str(verdict), 0) for verdict in Verdict}
     output.made(vars(summary) | {"verdicts": verdicts}, show, summary.complete)
+
+
+@command()
+def subset(
+    output: Output,
+    store: options.FolderOrUrl,
+    *,
+    out: options.NewStore,
+    assets: options.AssetIds = (),
+    chosen: options.ChosenOptions,
+    manifests: options.RecordsFolder | None = None,
+    jobs: options.Jobs = 1,
+) -> None:
+    """Make a store of some assets of STORE, without aligning them again.
+
+    Rows, records and ranges are copied unchanged. Assets must have one of the verdicts and
+    one of the categories; assets named by --asset are taken as well.
+
+    Parameters
+    ----------
+    assets
+        An asset; may be repeated.
+
+    Example
+    -------
+    slatprep subset data/demo.zarr --verdict good --out good.zarr
+    slatprep subset data/demo.zarr --asset 5f61cc --asset 803c1a --out two.zarr
+    """
+    if not (assets or chosen.verdicts or chosen.categories):
+        raise click.UsageError("say which assets: --asset ID, --verdict or --category")
+    from slatprep.inspect.listing import list_assets
+    from slatprep.pipeline.join import subset_store
+
+    wanted = list(assets)
+    if chosen.verdicts or chosen.categories:
+        opened = options.opened(store)
+        wanted += [asset.asset_id for asset in list_assets(opened, *chosen.of(opened))]
+    with output.progress("subset", "shards") as progress:
+        summary = subset_store(
+            store, out, wanted, manifests=manifests, jobs=jobs, progress=progress
+        )
+    report(output, summary)
+
+
+@command()
+def concat(
+    output: Output,
+    stores: tuple[options.FolderOrUrl, ...],
+    *,
+    out: options.NewStore,
+    manifests: options.RecordsFolder | None = None,
+    jobs: options.Jobs = 1,
+) -> None:
+    """Make one store of the assets of all STORES, without aligning them again.
+
+    The stores must have been built with the same parameters, and no id may be in two
+    of them. If each has the ranges of its own dataset, properties are converted to the
+    ranges of all.
+
+    Example
+    -------
+    slatprep concat first.zarr second.zarr --out both.zarr
+    """
+    from slatprep.pipeline.join import concat_stores
+
+    with output.progress("concat", "shards") as progress:
+        summary = concat_stores(stores, out, manifests=manifests, jobs=jobs, progress=progress)
+    report(output, summary)

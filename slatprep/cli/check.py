@@ -1,9 +1,11 @@
-"""`slatprep check-alignment`: check alignments by figures and pictures."""
+"""`slatprep check-alignment`, `score` and `measure-errors`: how good alignments are."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from itertools import zip_longest
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.inspect.check import AlignmentCheck
+    from slatprep.pipeline.decoys import MeasuredErrors
     from slatprep.records import Place
     from slatprep.store import Store
 
@@ -77,10 +80,9 @@ def check_alignment(
     path = options.chosen_store(store or named)
     from slatprep.inspect import check
     from slatprep.pipeline.decoys import measured_errors
-    from slatprep.store import open_store
     from slatprep.workers.local import run_unordered
 
-    opened = open_store(path)
+    opened = options.opened(path)
     chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     target = _target(path, picture, len(chosen))
     run = run_unordered(check.check_alignment, ((opened.path, one) for one in chosen), jobs)
@@ -110,7 +112,7 @@ def check_alignment(
         output.note(f"store: {path}")
 
     if show:
-        _show(output, opened, chosen, sheet or (pictures[0] if pictures else None))
+        _open_viewer(output, opened, chosen, sheet or (pictures[0] if pictures else None))
     assets = _documents(checks, pictures)
     if measured:
         for one in assets:
@@ -183,7 +185,7 @@ def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[
     return documents
 
 
-def _show(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:
+def _open_viewer(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:
     """Open the viewer, or print why that is not possible and where the picture is."""
     from slatprep.inspect.pictures.scene import scene_of
     from slatprep.inspect.pictures.viewer import has_screen, show_alignment
@@ -196,3 +198,121 @@ def _show(output: Output, store: Store, asset_ids: list[str], file: Path | None)
         if not show_alignment(scene_of(store.asset(asset_id)), asset_id):
             output.problem(f"Open3D could not open a window; {instead}")
             return
+
+
+@command()
+def score(output: Output, store: options.FolderOrUrl, truth_dir: options.Folder) -> None:
+    """Score STORE against known truth.
+
+    TRUTH_DIR holds an npz for each asset, as make-demo writes it. Figures of a
+    level leave out symmetric assets. Success is a mean displacement less than
+    1.5 voxels above that of the best similarity. Displacement is the median,
+    p90 the 90th percentile. Labels is the share of right classes; without
+    classes, of right properties. Beside it stands what the best similarity and
+    the true places would give. The exit code is 1 if an asset with a truth is
+    not in the store.
+
+    Example
+    -------
+    slatprep score demo.zarr demo/truth
+    """
+    from slatprep.inspect.score import score_against_truth
+
+    with output.progress("score") as progress:
+        report = score_against_truth(store, truth_dir, progress)
+
+    def show() -> None:
+        if output.verbosity > 0:
+            output.table(
+                "Assets against truth",
+                ("asset", "name", "level", "symmetric", "displacement", "best similarity",
+                 "labels", "best similarity", "true places", "valid"),
+                map(
+                    attrgetter("asset_id", "name", "level", "symmetric", "displacement",
+                               "similarity_displacement", *labels),
+                    report.assets,
+                ),
+            )  # fmt: skip
+        output.table(
+            "Places against truth (non-symmetric assets; displacement in voxels)",
+            ("level", "assets", "success", "displacement", "p90", "best similarity"),
+            [
+                (f"L{s.level}", s.assets, s.success, s.displacement_median, s.displacement_p90,
+                 s.similarity_displacement)
+                for s in report.levels
+            ],
+        )  # fmt: skip
+        output.table(
+            "Labels against truth (of the same assets; shares)",
+            ("level", "labels", "best similarity", "true places", "valid"),
+            [(f"L{s.level}", *attrgetter(*labels)(s)) for s in report.levels],
+        )
+
+    labels = ("label_accuracy", "similarity_accuracy", "truth_own", "valid_share")
+    for asset_id in report.missing:
+        output.problem(f"{truth_dir / asset_id}.npz: its asset is not in {store}")
+    output.result(report, show, complete=not report.missing)
+
+
+@command()
+def measure_errors(
+    output: Output,
+    store: options.LastStore,
+    *,
+    decoys: options.Positive = 200,
+    seed: int = 0,
+    picture: options.DrawnFile | None = None,
+    jobs: options.Jobs = 1,
+) -> None:
+    """Measure on decoys how many alignments of STORE show another object.
+
+    A decoy is an asset's grid aligned with the SLAT of another object of about its size.
+    Decoys show how wrong pairs of this dataset score. No asset of the store is
+    aligned again, and no verdict is changed. What decoys gave is kept in decoys.json beside
+    the store, and taken over after an update. A build does the same with fewer decoys.
+
+    Parameters
+    ----------
+    decoys : N
+        Align at most N grids with other SLATs.
+    seed
+        Seed of the draw of decoys.
+    picture
+        Also draw alignments and decoys as two histograms.
+
+    Example
+    -------
+    slatprep measure-errors data/demo.zarr --jobs 2 --picture errors.png
+    """
+    from slatprep.pipeline.decoys import measure_errors as measure
+
+    opened = options.opened(store)
+    with output.progress("decoys") as progress:
+        found = measure(opened, decoys, seed, jobs, progress)
+    if picture is not None:
+        from slatprep.inspect.pictures.errors import draw_errors
+
+        options.draw_to(output, picture, partial(draw_errors, found, opened.name))
+    output.result(_document(found), lambda: _show_errors(output, found))
+
+
+def _document(found: MeasuredErrors) -> dict[str, object]:
+    names = ("assets", "seed", "refitted", "wrong_share", "wrong_share_range", "good",
+             "good_wrong", "good_wrong_range", "errors")  # fmt: skip
+    kept = {f"{kept.rate:g}": kept.assets for kept in found.kept}
+    own = {name: getattr(found, name) for name in names}
+    return own | {"decoys": len(found.decoys), "kept": kept}
+
+
+def _show_errors(output: Output, found: MeasuredErrors) -> None:
+    for sentence in found.sentences():
+        output.note(sentence)
+    output.table(
+        "Assets that can be kept, by the share of wrong ones among them",
+        ("wrong at most", "assets", "of all"),
+        [(f"{kept.rate:.1%}", kept.assets, kept.assets / found.assets) for kept in found.kept],
+    )
+    worst = sorted(found.errors.items(), key=lambda one: (-one[1], one[0]))[:10]
+    likely = [(asset_id, error) for asset_id, error in worst if error >= 0.5]
+    if likely:
+        output.table("Most likely another object", ("id", "probability"), likely)

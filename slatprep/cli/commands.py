@@ -20,24 +20,24 @@ GROUPS = {
         "extract-slat": "slatprep.cli.extract:extract_slat",
         "build-store": "slatprep.cli.build:build_store",
         "align": "slatprep.cli.build:align",
-        "subset": "slatprep.cli.join:subset",
-        "concat": "slatprep.cli.join:concat",
+        "subset": "slatprep.cli.build:subset",
+        "concat": "slatprep.cli.build:concat",
     },
     "Look and check": {
         "info": "slatprep.cli.info:info",
-        "list": "slatprep.cli.list:list_assets",
+        "list": "slatprep.cli.info:list_assets",
         "stats": "slatprep.cli.stats:stats",
-        "report": "slatprep.cli.report:report",
+        "report": "slatprep.cli.info:report",
         "check-alignment": "slatprep.cli.check:check_alignment",
-        "score": "slatprep.cli.score:score",
-        "measure-errors": "slatprep.cli.errors:measure_errors",
+        "score": "slatprep.cli.check:score",
+        "measure-errors": "slatprep.cli.check:measure_errors",
     },
     "Take elsewhere": {
         "export": "slatprep.cli.export:export",
-        "transfer": "slatprep.cli.transfer:transfer",
-        "simulate": "slatprep.cli.simulate:simulate",
+        "transfer": "slatprep.cli.particles:transfer",
+        "simulate": "slatprep.cli.particles:simulate",
         "decode-slat": "slatprep.cli.extract:decode_slat",
-        "describe": "slatprep.cli.describe:describe",
+        "describe": "slatprep.cli.publish:describe",
         "publish": "slatprep.cli.publish:publish",
     },
     "Learn": {
@@ -47,7 +47,7 @@ GROUPS = {
     },
     "Maintain": {
         "verify": "slatprep.cli.verify:verify",
-        "diff": "slatprep.cli.diff:diff",
+        "diff": "slatprep.cli.verify:diff",
     },
 }
 """Commands by what people do; to add a command, add its name and function here.

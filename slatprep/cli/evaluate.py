@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from slatprep.learn.published import PublishedScore
     from slatprep.records import Place
 
-_LISTED = 10
-"""How many assets without a prediction are named; ``--json`` has all."""
-
 
 @command()
 def evaluate(
@@ -120,10 +117,7 @@ def evaluate(
         draw_comparison(measures, SPREADS[spread], picture)
         output.note(f"picture: {picture}")
 
-    for problem in problems[:_LISTED]:
-        output.problem(problem)
-    if len(problems) > _LISTED:
-        output.problem(f"and {len(problems) - _LISTED:,} more: --json lists them")
+    output.problems(problems, "--json lists them")
     document = vars(result) | {"store": store}
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]
@@ -164,7 +158,6 @@ def _selection(
     """Return the split of each object and which assets count, by the options or else by a run."""
     from slatprep.learn.predictions import RUN_FILE, selection_of_run
     from slatprep.learn.splits import assign_store
-    from slatprep.store import open_store
 
     rule, how = splits.rule, f"by {splits.rule['by']}"
     selection: dict[str, Any] | None = None
@@ -175,7 +168,7 @@ def _selection(
         how = f"as {predictions.absolute().parent / RUN_FILE} says"
     elif not splits.given:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
-    assignment = assign_store(open_store(store), **rule)
+    assignment = assign_store(options.opened(store), **rule)
     options.note_split(output, assignment, f"{split}, {how}")
     return {"splits": assignment.splits, **(selection or {})}
 

@@ -110,10 +110,9 @@ def export(
     """
     given = format_options.of(kind)
     from slatprep.export import ExportOptions, export_store
-    from slatprep.store import open_store
 
     if verdicts is None and not assets:
-        options.note_left_out(output, open_store(store))
+        options.note_left_out(output, options.opened(store))
     chosen: tuple[Sequence[str], Sequence[str] | None] = (assets, verdicts)
     if split != "all":
         chosen = _of_split(output, store, split, splits.rule, assets, verdicts)
@@ -149,11 +148,10 @@ def _of_split(
     """Return the assets of a split and the verdicts that may go out."""
     from slatprep.learn.splits import assign_store, select_assets
     from slatprep.records import USABLE
-    from slatprep.store import open_store
 
     if assets:
         raise ConfigError("--asset and --split both choose; give one of them")
-    store = open_store(place)
+    store = options.opened(place)
     assignment = assign_store(store, **rule)
     options.note_split(output, assignment, f"{split}, by {rule['by']}")
     rows = select_assets(store, split, splits=assignment.splits)

@@ -1,4 +1,4 @@
-"""`slatprep info`: the contents of a store."""
+"""`slatprep info`, `list` and `report`: the contents of a store."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slatprep.cli.options import LastStore
+from slatprep.cli import options
 from slatprep.cli.output import Cell, Output, say
 from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
+    from slatprep.records import Place
     from slatprep.store import Store
 
 
 @command()
-def info(output: Output, store: LastStore) -> None:
+def info(output: Output, store: options.LastStore) -> None:
     """Show what is in STORE, and how good its alignments are.
 
     Without STORE, the one that `make align` built last under data/ is taken.
@@ -27,9 +28,8 @@ def info(output: Output, store: LastStore) -> None:
     """
     from slatprep.inspect.overview import overview_of
     from slatprep.pipeline.decoys import told_of
-    from slatprep.store import open_store
 
-    opened = open_store(store)
+    opened = options.opened(store)
     overview = overview_of(opened)
 
     def show() -> None:
@@ -122,3 +122,116 @@ def _source_of_categories(overview: StoreOverview) -> str:
     if parameters and parameters.pixieverse.adapter != "pixieverse":
         table, form = '"FILE.json"', ': {"ID": {"obj_class": "CATEGORY"}}'
     return f"categories = {table} under [pairing] of a --config FILE gives it{form}"
+
+
+@command("list")
+def list_assets(
+    output: Output,
+    store: options.LastStore,
+    *,
+    chosen: options.ChosenOptions,
+    max_confidence: float | None = None,
+    ids: bool = False,
+) -> None:
+    """List the assets of STORE, with the reasons of their verdicts.
+
+    On a terminal ids are shortened to prefixes that no other id has; all commands accept
+    such prefixes. Without STORE, the one that `make align` built last under data/ is taken.
+
+    Parameters
+    ----------
+    max_confidence
+        Only assets with at most this confidence.
+    ids
+        Print only the full ids, one on each line.
+
+    Example
+    -------
+    slatprep list data/demo.zarr --verdict doubtful --verdict failed
+    slatprep list data/demo.zarr --category tree --ids
+    """
+    from slatprep.inspect.listing import list_assets as listed_of
+    from slatprep.pipeline.decoys import measured_errors
+
+    opened = options.opened(store)
+    listed = list(listed_of(opened, *chosen.of(opened), max_confidence))
+
+    def show() -> None:
+        if ids:
+            for asset in listed:
+                say(asset.asset_id)
+            return
+        length = output.id_length(opened.ids)
+        columns = ("category", "verdict", "confidence", "fitness")
+        why = _in_short if length else "; ".join
+        rows = ((a.asset_id[:length], *attrgetter(*columns)(a), why(a.reasons)) for a in listed)
+        title = f"{len(listed):,} of {len(opened):,} assets"
+        output.table(title, ("id", *columns, "why"), rows)
+        if measured_errors(opened.path):
+            show_errors(opened)
+
+    output.result({"store": store, "assets": listed}, show)
+
+
+def _in_short(reasons: tuple[str, ...]) -> str:
+    more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+    return f"{reasons[0]}{more}" if reasons else ""
+
+
+@command()
+def report(
+    output: Output,
+    store: options.LastStore,
+    *,
+    out: options.NewFile | None = None,
+    manifests: options.Folder | None = None,
+    jobs: options.Jobs = 1,
+) -> None:
+    """Write a page about STORE that opens in a browser.
+
+    The page is a single HTML file and needs no network. It has the assets by
+    state with reasons, histograms, orientations, classes and properties, and a
+    table that shows each asset in 3D. Without STORE, it takes the one that
+    `make align` built last under data/.
+
+    Parameters
+    ----------
+    out : FILE.html
+        The page. [default: beside the store]
+    manifests
+        Folder of the build's records. [default: beside the store, or manifests/build/NAME]
+
+    Example
+    -------
+    slatprep report data/demo.zarr
+    slatprep report data/demo.zarr --out demo.html --manifests manifests/build/demo
+    """
+    from slatprep.inspect.report import write_report
+    from slatprep.store.records import manifests_beside
+
+    opened = options.opened(store)
+    name = store.name.removesuffix(".zarr")
+    records: Place | None = manifests
+    if records is None:
+        of_make = Path("manifests/build") / name
+        records = manifests_beside(opened.path) or (of_make if of_make.is_dir() else None)
+    if records is None:
+        output.problem(
+            f"no records of {store} found; the page cannot list assets that are not in the store. "
+            "Name their folder with --manifests"
+        )
+    with output.progress("report") as progress:
+        summary = write_report(
+            opened,
+            out or options.beside(store, ".html"),
+            manifests=records,
+            jobs=jobs,
+            progress=progress,
+        )
+
+    def show() -> None:
+        say(f"page:   {summary.path} ({summary.size / 1e6:,.1f} MB)")
+        listed = f"{summary.listed:,} in the table, " if summary.listed < summary.assets else ""
+        say(f"assets: {summary.assets:,}, {listed}{summary.in_detail:,} of them with a 3D view")
+
+    output.made(summary, show)

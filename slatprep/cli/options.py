@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 import click
 
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click
-from slatprep.cli.targets import NewPath
+from slatprep.cli.signature import Click, NewPath
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -103,6 +102,13 @@ FileOrUrl = Annotated[Place, PlaceType(path_type=Path, exists=True)]
 """A file or folder that exists, or a URL."""
 FolderOrUrl = Annotated[Place, PlaceType(path_type=Path, exists=True, file_okay=False)]
 """A folder that exists, such as a store, or a URL."""
+
+
+def opened(store: Place) -> Store:
+    """Open a store; the module is imported here, since ``slatprep --help`` needs none of it."""
+    from slatprep.store import open_store
+
+    return open_store(store)
 
 
 def chosen_store(store: Place | None) -> Place:

@@ -45,6 +45,7 @@ _MAY_SHRINK = ("category", "group", "model", "why", "A", "B")
 """Columns whose texts are cut, or wrapped between words, on a narrow terminal."""
 _LEAST_WIDTH, _GAP = 12, 2
 _LEAST_ID = 8
+_LISTED = 10
 _SECONDS_BETWEEN_LINES = 30.0
 _LEAST_DONE = 2
 """Fewest assets done for an estimate of the time left."""
@@ -110,6 +111,13 @@ class Output:
     def problem(self, message: str) -> None:
         """Print a line on standard error about something that failed."""
         say(message, err=True)
+
+    def problems(self, messages: Sequence[str], where: str) -> None:
+        """Print the first lines about what failed, and where the others are, if there are more."""
+        for message in messages[:_LISTED]:
+            self.problem(message)
+        if len(messages) > _LISTED:
+            self.problem(f"and {len(messages) - _LISTED:,} more: {where}")
 
     def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
         """Print a table; columns of numbers are aligned to the right."""

@@ -49,9 +49,8 @@ def stats(
     """
     from slatprep.inspect.distributions import COLUMNS, table_of
     from slatprep.inspect.statistics import store_statistics
-    from slatprep.store import open_store
 
-    opened = open_store(store)
+    opened = options.opened(store)
     with output.progress("stats") as progress:
         found = store_statistics(
             opened, *chosen.of(opened), weight=weight, jobs=jobs, progress=progress

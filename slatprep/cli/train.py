@@ -130,7 +130,6 @@ def train(
     from slatprep.learn.train import train as run
     from slatprep.records import USABLE, Verdict
     from slatprep.storage.atomic import writing
-    from slatprep.store import open_store
 
     source = click.get_current_context().get_parameter_source
     given = {
@@ -144,7 +143,7 @@ def train(
             own.pop("steps", None)
         training = dataclasses.replace(training, **own)
     torch.set_num_threads(threads or os.cpu_count() or 1)
-    opened, rule = open_store(store), splits.rule
+    opened, rule = options.opened(store), splits.rule
     options.note_split(output, assign_store(opened, **rule), f"by {rule['by']}")
     if verdicts is None:
         verdicts = USABLE

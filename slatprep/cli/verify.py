@@ -1,4 +1,4 @@
-"""`slatprep verify`: verify a store."""
+"""`slatprep verify` and `diff`: whether a store is whole, and what two differ in."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ from typing import TYPE_CHECKING
 
 import click
 
-from slatprep.cli.options import FolderOrUrl, LastStore, Positive, WorkersOptions
-from slatprep.cli.output import Output, say
+from slatprep.cli import options
+from slatprep.cli.output import Cell, Output, say
 from slatprep.cli.signature import command
 from slatprep.errors import StoreError, amount
 
 if TYPE_CHECKING:
+    from slatprep.inspect.difference import AssetChange, StoreDifference
     from slatprep.records import Place
 
 
 @command()
 def verify(
     output: Output,
-    store: LastStore,
+    store: options.LastStore,
     *,
-    manifests: FolderOrUrl | None = None,
+    manifests: options.FolderOrUrl | None = None,
     sources: bool = False,
-    pixieverse: FolderOrUrl | None = None,
-    slat: FolderOrUrl | None = None,
-    also: tuple[FolderOrUrl, ...] = (),
-    sample: Positive | None = None,
-    workers: WorkersOptions,
+    pixieverse: options.FolderOrUrl | None = None,
+    slat: options.FolderOrUrl | None = None,
+    also: tuple[options.FolderOrUrl, ...] = (),
+    sample: options.Positive | None = None,
+    workers: options.WorkersOptions,
 ) -> None:
     """Check that STORE is whole, unchanged and consistent.
 
@@ -96,12 +97,127 @@ def verify(
 
 def _left_by_make(store: Place) -> Place | None:
     """Return the folder where `make align` leaves a store's records, if they are of this build."""
-    from slatprep.store import open_store
     from slatprep.store.records import build_in
 
     folder = Path("manifests/build") / store.name.removesuffix(".zarr")
     try:
-        own = build_in(folder).id == open_store(store).about.manifest
+        own = build_in(folder).id == options.opened(store).about.manifest
     except (OSError, StoreError):
         return None
     return folder if own else None
+
+
+_SHOWN = 20
+_NAMED = 3
+"""Most columns that are named in a line; --json names all."""
+
+_VALUE = 20
+"""Characters of a setting: enough for a number or the beginning of a digest."""
+
+
+@command()
+def diff(
+    output: Output,
+    a: options.FolderOrUrl,
+    b: options.FolderOrUrl,
+    *,
+    worst: options.Positive | None = None,
+    jobs: options.Jobs = 1,
+) -> None:
+    """Show what changed from store A to store B, in total and by asset.
+
+    Lists assets in only one of the stores; changed sources, verdicts, placements, labels,
+    properties in SI units and latents of assets in both; and different ranges, parameters
+    and versions. The exit code is 1 where the stores differ.
+
+    Parameters
+    ----------
+    worst : N
+        Number of changed assets to list, those with most changed labels first. [default: 20; with
+        --json all]
+
+    Example
+    -------
+    slatprep diff old.zarr new.zarr
+    slatprep diff old.zarr new.zarr --json --worst 100
+    """
+    from slatprep.inspect.compare import compare_stores
+
+    if worst is None and not output.as_json:
+        worst = _SHOWN
+    with output.progress("diff") as progress:
+        found = compare_stores(a, b, worst=worst, jobs=jobs, progress=progress)
+    output.result(found, lambda: _show_difference(output, found), complete=found.same)
+
+
+def _show_difference(output: Output, found: StoreDifference) -> None:
+    if found.same:
+        say(f"{found.a} and {found.b} hold the same")
+        return
+    output.record(
+        f"A: {found.a}\nB: {found.b}",
+        {
+            "assets in both": found.assets,
+            "changed": found.changed,
+            "only in A": len(found.only_a),
+            "only in B": len(found.only_b),
+        },
+    )
+    for store, ids in (("A", found.only_a), ("B", found.only_b)):
+        for asset_id in ids[:_SHOWN]:
+            say(f"only in {store}: {asset_id}")
+        if len(ids) > _SHOWN:
+            say(f"only in {store}: {len(ids) - _SHOWN:,} more (--json has all)")
+    if found.settings:
+        output.table(
+            "Settings",
+            ("setting", "A", "B"),
+            [(one.name, _value(one.a), _value(one.b)) for one in found.settings],
+        )
+    if found.what:
+        output.table(
+            "Assets that changed, by what",
+            ("what", "assets", "how"),
+            [(what, count, _how(found, what)) for what, count in found.what.items()],
+        )
+    changed = {name: own for name, own in found.properties.items() if own.changed}
+    if changed:
+        output.table(
+            "Properties of voxels that are valid in both: absolute change",
+            ("property", "voxels", "changed", "mean", "most", "mean of log10"),
+            [(name, *vars(own).values()) for name, own in changed.items()],
+        )
+    if found.worst:
+        length = output.id_length([one.asset_id for one in found.worst])
+        output.table(
+            f"{len(found.worst):,} of {found.changed:,} assets that changed",
+            ("id", "verdict", "moved", "labels", "why"),
+            [_line(one, length) for one in found.worst],
+        )
+
+
+def _how(found: StoreDifference, what: str) -> str:
+    """Return the extent of a kind of change over all assets, where it has one."""
+    if what == "verdict":
+        return ", ".join(f"{count:,} {words}" for words, count in found.verdicts.items())
+    if what == "placement":
+        return f"by {found.moved:.3g} voxels (median), at most {found.moved_most:.3g}"
+    if what == "labels":
+        return f"{found.labels:,} of {found.voxels:,} voxels ({found.labels / found.voxels:.2%})"
+    return ""
+
+
+def _line(one: AssetChange, length: int | None) -> tuple[Cell, ...]:
+    verdict = one.verdicts[1] if "verdict" not in one.what else " > ".join(one.verdicts)
+    more = {"sources": ", ".join(one.sources), "columns": ", ".join(one.columns)}
+    if len(one.columns) > _NAMED:
+        more["columns"] = f"{len(one.columns)}"
+    why = (f"{what} ({more[what]})" if more.get(what) else what for what in one.what)
+    labels = one.labels / one.voxels if one.voxels else None
+    return (one.asset_id[:length], verdict, one.moved, labels, ", ".join(why))
+
+
+def _value(value: object) -> str:
+    """Return a setting cut to `_VALUE` characters; ``--json`` has all of it."""
+    text = "-" if value is None else str(value)
+    return text if len(text) <= _VALUE else f"{text[: _VALUE - 3]}..."
