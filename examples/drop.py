@@ -25,7 +25,7 @@ from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.particles.fields import stored_field
 from slatprep.particles.read import read_particles
-from slatprep.particles.simulate import rigid_deviation, simulate, strain
+from slatprep.particles.simulate import rigid_deviation, simulate_motion, strain
 from slatprep.particles.transfer import transfer, write_transferred
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
@@ -84,10 +84,10 @@ def run(options: argparse.Namespace) -> None:
         asset = store.asset(name)
     spacing = options.size / options.particles
     begin = time.perf_counter()
-    frames = simulate(
+    frames = simulate_motion(
         options.size * positions, material, properties, spacing, height=0.25 * options.size,
         seconds=options.seconds, rate=RATE, substeps=options.substeps,
-    )  # fmt: skip
+    ).positions  # fmt: skip
     print(
         f"{len(positions)} particles, simulated {options.seconds} s in "
         f"{time.perf_counter() - begin:.0f} s"

@@ -29,7 +29,7 @@ from slatprep.errors import SlatprepError
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.particles.fields import VoxelField, predicted_field, stored_field
-from slatprep.particles.simulate import simulate
+from slatprep.particles.simulate import simulate_motion
 from slatprep.particles.transfer import transfer
 from slatprep.readers.ranges import read_ranges
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS
@@ -116,13 +116,13 @@ def run(name: str, source: tuple[np.ndarray, VoxelField], options: argparse.Name
     foot = positions[:, 2] < positions[:, 2].min() + 1.5 / options.particles
     windy = options.wind != 0
     begin = time.perf_counter()
-    frames = simulate(
+    frames = simulate_motion(
         options.size * positions, given.material, given.properties, spacing,
         height=0.0 if windy else 0.25 * options.size, gravity=0.0 if windy else 9.81,
         wind=(options.wind, 0.0, 0.0),
         fixed=(foot | np.isin(given.material, HELD)) if windy else None,
         seconds=options.seconds, rate=RATE, substeps=options.substeps,
-    )  # fmt: skip
+    ).positions  # fmt: skip
     counts = {MATERIAL_CLASSES[k]: int(n) for k, n in enumerate(np.bincount(given.material)) if n}
     print(
         f"{name}: {counts}, {options.seconds} s in {time.perf_counter() - begin:.0f} s; moved "

@@ -25,12 +25,14 @@ PIXIE_RANGES = Normalization(
 )
 """Pixie's published ranges, the 1st and 99th percentile of its dataset."""
 
+_Table = Sequence[Property | PropertyRange]
+
 # A property with one value in the whole dataset has no range of its own; this
 # much on either side of it makes the mapping defined and sends it to 0.
 _HALF_WIDTH_OF_A_POINT = 0.5
 
 
-def to_mapped(properties: ArrayLike, table: Sequence[Property] = PROPERTIES) -> NDArray[np.float64]:
+def to_mapped(properties: ArrayLike, table: _Table = PROPERTIES) -> NDArray[np.float64]:
     """Map SI properties (N, P) to their log10 where the table says so; the others stay."""
     mapped = np.array(properties, dtype=np.float64)
     columns = [column for column, one in enumerate(table) if one.log10]
@@ -38,7 +40,7 @@ def to_mapped(properties: ArrayLike, table: Sequence[Property] = PROPERTIES) -> 
     return mapped
 
 
-def from_mapped(mapped: ArrayLike, table: Sequence[Property] = PROPERTIES) -> NDArray[np.float32]:
+def from_mapped(mapped: ArrayLike, table: _Table = PROPERTIES) -> NDArray[np.float32]:
     """Bring mapped properties (N, P) back to SI units, the inverse of `to_mapped`."""
     properties = np.array(mapped, dtype=np.float64)
     columns = [column for column, one in enumerate(table) if one.log10]
@@ -131,17 +133,11 @@ def normalize_and_count(
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Normalise as `normalize_properties`, and count the clipped values per property (P,)."""
     given = _in_columns(properties, normalization)
-    values = np.empty(given.shape, dtype=np.float32)
-    clipped = np.zeros(len(normalization.ranges), dtype=np.int64)
-    for column, span in enumerate(normalization.ranges):
-        mapped = given[..., column].astype(np.float64)
-        if span.log10:
-            np.log10(mapped, out=mapped)
-        # Counted after rounding: a range's own end point must not count as clipped.
-        value = (2.0 * (mapped - span.lo) / (span.hi - span.lo) - 1.0).astype(np.float32)
-        clipped[column] = np.count_nonzero(np.abs(value) > 1.0)
-        values[..., column] = np.clip(value, -1.0, 1.0)
-    return values, clipped
+    mapped = to_mapped(given, normalization.ranges)
+    # Counted after rounding: a range's own end point must not count as clipped.
+    values = normalize_mapped(mapped, normalization).astype(np.float32)
+    clipped = (np.abs(values) > 1.0).sum(axis=tuple(range(values.ndim - 1)))
+    return np.clip(values, -1.0, 1.0), clipped
 
 
 def denormalize_properties(
@@ -161,12 +157,9 @@ def denormalize_properties(
     ndarray of float32, shape (N, P)
         In SI units. Clipped values come back as the end of their range.
     """
-    given = _in_columns(values, normalization)
-    properties = np.empty(given.shape, dtype=np.float32)
-    for column, span in enumerate(normalization.ranges):
-        mapped = (given[..., column].astype(np.float64) + 1.0) * 0.5 * (span.hi - span.lo) + span.lo
-        properties[..., column] = 10.0**mapped if span.log10 else mapped
-    return properties
+    return from_mapped(
+        _undone(_in_columns(values, normalization), normalization), normalization.ranges
+    )
 
 
 def _in_columns(values: ArrayLike, normalization: Normalization) -> NDArray[Any]:
@@ -181,22 +174,29 @@ def _in_columns(values: ArrayLike, normalization: Normalization) -> NDArray[Any]
 
 def change_ranges(values: ArrayLike, old: Normalization, new: Normalization) -> NDArray[np.float64]:
     """Bring values (N, P) normalised by some ranges to others; nothing is clipped."""
-    changed = np.array(values, dtype=np.float64)
-    for column, (one, other) in enumerate(zip(old.ranges, new.ranges, strict=True)):
-        mapped = (changed[..., column] + 1.0) * 0.5 * (one.hi - one.lo) + one.lo
-        changed[..., column] = 2.0 * (mapped - other.lo) / (other.hi - other.lo) - 1.0
-    return changed
+    return normalize_mapped(_undone(values, old), new)
 
 
 def normalize_mapped(mapped: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
     """Normalise mapped properties (N, P); nothing is clipped."""
-    lo, hi = np.array([[one.lo, one.hi] for one in normalization.ranges]).T
+    lo, hi = _ends(normalization)
     normalized: NDArray[np.float64] = 2.0 * (np.asarray(mapped) - lo) / (hi - lo) - 1.0
     return normalized
 
 
+def _undone(values: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
+    """Bring normalised properties (N, P) back to mapped ones."""
+    lo, hi = _ends(normalization)
+    mapped: NDArray[np.float64] = (np.asarray(values, np.float64) + 1.0) * 0.5 * (hi - lo) + lo
+    return mapped
+
+
 def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray[np.float64]:
     """Scale differences (N, P) of mapped properties to differences of normalised ones."""
-    spans = np.array([one.hi - one.lo for one in normalization.ranges])
-    scaled: NDArray[np.float64] = np.asarray(change, dtype=np.float64) * 2.0 / spans
+    lo, hi = _ends(normalization)
+    scaled: NDArray[np.float64] = np.asarray(change, dtype=np.float64) * 2.0 / (hi - lo)
     return scaled
+
+
+def _ends(normalization: Normalization) -> NDArray[np.float64]:
+    return np.array([[one.lo, one.hi] for one in normalization.ranges]).T

@@ -8,7 +8,9 @@ as Numba takes as long to load as all else that reads a store.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -192,7 +194,7 @@ def is_proper(deformation: Deformation) -> bool:
         return bool(np.linalg.det(deformation.affine[:, :3]) > 0)
     from slatprep.geometry.bspline import least_stretch
 
-    fall = _largest_second_derivative(c) / spacing**2 * np.sqrt(3.0) / 2.0 * spacing
+    fall = _second_derivative(c, np.max) / spacing**2 * np.sqrt(3.0) / 2.0 * spacing
     return any(
         least_stretch(deformation.affine, spacing, c, steps) > fall / steps for steps in (2, 4)
     )
@@ -200,28 +202,19 @@ def is_proper(deformation: Deformation) -> bool:
 
 def bending_of(deformation: Deformation) -> float:
     """Return the rms second derivative of the displacement over the lattice, in 1 / voxel."""
+    return _second_derivative(deformation.coefficients, np.mean) / (
+        deformation.spacing**2 * RESOLUTION
+    )
+
+
+def _second_derivative(
+    coefficients: NDArray[np.float64], over: Callable[[NDArray[np.float64]], np.floating[Any]]
+) -> float:
+    """Return the Frobenius norm, in 1 / spacing^2, of squared differences `over` the lattice."""
     squares = 0.0
-    for axis, second in _second_differences(deformation.coefficients):
-        squares += (1.0 if axis else 2.0) * float((second**2).sum(axis=-1).mean())
-    return float(np.sqrt(squares)) / (deformation.spacing**2 * RESOLUTION)
-
-
-def _second_differences(
-    coefficients: NDArray[np.float64],
-) -> list[tuple[bool, NDArray[np.float64]]]:
-    """Return pure (True) and mixed (False) second differences of the coefficients."""
-    pure = [(True, np.diff(coefficients, n=2, axis=axis)) for axis in range(3)]
-    mixed = [
-        (False, np.diff(np.diff(coefficients, axis=a), axis=b)) for a, b in ((0, 1), (1, 2), (0, 2))
-    ]
-    return pure + mixed
-
-
-def _largest_second_derivative(coefficients: NDArray[np.float64]) -> float:
-    """Bound the second derivative, in 1 / spacing^2, in the Frobenius norm."""
-    squares = 0.0
-    for pure, second in _second_differences(coefficients):
-        squares += (1.0 if pure else 2.0) * float((second**2).sum(axis=-1).max())
+    for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):
+        second = np.diff(np.diff(coefficients, axis=a), axis=b)
+        squares += (1.0 if a == b else 2.0) * float(over((second**2).sum(axis=-1)))
     return float(np.sqrt(squares))
 
 

@@ -121,21 +121,14 @@ def spread(slab, least):  # type: ignore[no-untyped-def]
         while apart < rows and apart * apart < largest:
             square = np.int16(apart * apart)
             low, high = i - apart, i + apart
-            if low >= 0 and high < rows:
-                for k in range(columns):
-                    below, above, known = slab[low, k], slab[high, k], least[i, k]
-                    value = np.int16((below if below < above else above) + square)
-                    least[i, k] = value if value < known else known
-            elif low >= 0:
-                for k in range(columns):
-                    value, known = np.int16(slab[low, k] + square), least[i, k]
-                    least[i, k] = value if value < known else known
-            elif high < rows:
-                for k in range(columns):
-                    value, known = np.int16(slab[high, k] + square), least[i, k]
-                    least[i, k] = value if value < known else known
-            else:
+            if low < 0 and high >= rows:
                 break
+            # At an end of the slab the one row that there is stands for both.
+            low, high = (low if low >= 0 else high), (high if high < rows else low)
+            for k in range(columns):
+                below, above, known = slab[low, k], slab[high, k], least[i, k]
+                value = np.int16((below if below < above else above) + square)
+                least[i, k] = value if value < known else known
             if apart % 4 == 0:
                 largest = np.int16(0)
                 for k in range(columns):

@@ -106,10 +106,8 @@ def split_transform(
 def invert_transform(transform: ArrayLike) -> NDArray[np.float64]:
     """Return the inverse of a similarity transform (4, 4); ValueError as `split_transform`."""
     rotation, translation, scale = split_transform(transform)
-    inverse = np.eye(4)
-    inverse[:3, :3] = rotation.T / scale
-    inverse[:3, 3] = -inverse[:3, :3] @ translation
-    return inverse
+    linear = rotation.T / scale
+    return make_transform(linear, -linear @ translation)
 
 
 def places_of(points: ArrayLike, transform: ArrayLike) -> NDArray[np.float64]:
@@ -139,10 +137,7 @@ def nearest_similarity(
     u, values, v = np.linalg.svd(b.T @ a)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
     linear = (u * signs) @ v * (float(values @ signs) / float((a * a).sum()))
-    transform = np.eye(4)
-    transform[:3, :3] = linear
-    transform[:3, 3] = target.mean(axis=0) - linear @ source.mean(axis=0)
-    return transform
+    return make_transform(linear, target.mean(axis=0) - linear @ source.mean(axis=0))
 
 
 def even_directions(count: int) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.geometry.voxels import voxels_of
-from slatprep.learn.metrics import METRICS, Measure, Spread, average_objects, score_asset
+from slatprep.learn.metrics import METRICS, Measure, Spread, average_methods, score_asset
 from slatprep.learn.predictions import (
     ReadAsset,
     VoxelPrediction,
@@ -109,12 +109,11 @@ def compare_methods(
     """
     store = open_store(store_path)
     _require_pixieverse(store)
-    object_ids, categories = store.column("object_id"), store.column("category")
+    object_ids = store.column("object_id")
     found = {name: find_grids(PixieverseSource(root, _GRIDS)) for name, root in grids.items()}
     names = [OURS] if predictions else []
     names += [f"{name}, {where}" for name in grids for where in ("SLAT voxels", "own grid")]
-    scored: list[int] = []
-    scores: list[list[NDArray[np.float64]]] = []
+    scored: dict[int, list[NDArray[np.float64]]] = {}
     partly: set[str] = set()
     problems: list[str] = []
     chosen = select_assets(
@@ -131,8 +130,7 @@ def compare_methods(
             except InputError as error:
                 problems.append(str(error))
                 continue
-            scored.append(index)
-            scores.append(rows)
+            scored[index] = rows
             if (truth.grid == UNANNOTATED).any():
                 partly.add(object_id)
     if not scored:
@@ -142,13 +140,7 @@ def compare_methods(
             f"({problems[0] if problems else 'the split is empty'})",
             "predictions of the same objects",
         )
-    of_objects, of_categories = (
-        [str(column[index]) for index in scored] for column in (object_ids, categories)
-    )
-    measured = {
-        name: average_objects([rows[k] for rows in scores], of_objects, of_categories, spread)
-        for k, name in enumerate(names)
-    }
+    measured = average_methods(store, scored, names, spread)
     return Comparison(
         spread,
         {name: overall for name, (overall, _) in measured.items()},

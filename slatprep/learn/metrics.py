@@ -1,23 +1,27 @@
-"""Pixie's protocol as SLAT-Phys states it: means over voxels, then over objects."""
+"""Pixie's protocol as SLAT-Phys states it: means over voxels, then over objects.
+
+Beside predictions it measures two reference models: the training mean, and a linear model of
+single voxels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.learn.baselines import COLUMNS, fit_baselines
+from slatprep.geometry.frames import voxel_centres
 from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
 from slatprep.learn.splits import select_assets
 from slatprep.readers.splits import Shares, Split
 from slatprep.records import Normalization, Place
-from slatprep.store import open_store
+from slatprep.store import Store, open_store
 
 METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
 """Mean squared errors in normalised space, their mean, and class accuracy.
@@ -87,7 +91,7 @@ class Evaluation:
         Assets whose prediction was normalised by other ranges and was converted to the
         store's.
     baselines : dict of str to Measure
-        The reference models on the same assets, see `slatprep.learn.baselines`; empty if the
+        The reference models on the same assets, see `fit_baselines`; empty if the
         split train has no object.
     """
 
@@ -156,6 +160,26 @@ def average_objects(
     return measure(per_object, spread, names), groups
 
 
+def average_methods(
+    store: Store,
+    scored: Mapping[int, Sequence[NDArray[np.float64]]],
+    methods: Sequence[str],
+    spread: Spread,
+) -> dict[str, tuple[Measure, dict[str, Measure]]]:
+    """Average the metrics of several methods as `average_objects`; `scored` has them by asset."""
+    objects, categories = (
+        [str(column[index]) for index in scored]
+        for column in (store.column("object_id"), store.column("category"))
+    )
+    names = metrics_of(store.normalization)
+    return {
+        method: average_objects(
+            [rows[k] for rows in scored.values()], objects, categories, spread, names
+        )
+        for k, method in enumerate(methods)
+    }
+
+
 def evaluate_store(
     predictions: Path,
     store_path: Place,
@@ -172,9 +196,7 @@ def evaluate_store(
     filters. InputError if no asset of the split has a prediction, or a prediction cannot be used.
     """
     store = open_store(store_path)
-    object_ids, categories = store.column("object_id"), store.column("category")
-    scored: list[int] = []
-    scores: list[NDArray[np.float64]] = []
+    scored: dict[int, list[NDArray[np.float64]]] = {}
     missing: list[str] = []
     converted = 0
     select = partial(
@@ -187,7 +209,6 @@ def evaluate_store(
     )
     chosen, trained = select(split), select("train").tolist()
     baselines = fit_baselines(store, trained) if trained else ()
-    theirs: list[list[NDArray[np.float64]]] = [[] for _ in baselines]
     with open_predictions(predictions) as read:
         for index in chosen.tolist():
             asset_id = store.ids[index]
@@ -200,25 +221,86 @@ def evaluate_store(
             source, ranges = f"{predictions}/{asset_id}", store.normalization
             prediction = check_prediction(source, arrays, rows["coords"], ranges, store.contents)
             converted += prediction.converted
-            scored.append(index)
             if not store.contents.classes:
                 prediction = replace(prediction, material=None)
-            scores.append(score_asset(prediction, *truth))
-            for one, own in zip(baselines, theirs, strict=True):
-                own.append(score_asset(one.predict(rows), *truth))
+            methods = prediction, *(one.predict(rows) for one in baselines)
+            scored[index] = [score_asset(one, *truth) for one in methods]
     if not scored:
         raise InputError(
             predictions,
             f"has no prediction of an asset of split {split or 'all'}",
             f"ids of that split, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
         )
-    average = partial(
-        average_objects,
-        objects=[str(object_ids[k]) for k in scored],
-        categories=[str(categories[k]) for k in scored],
-        spread=spread,
-        names=metrics_of(store.normalization),
-    )
-    overall, groups = average(scores)
-    beside = {one.name: average(own)[0] for one, own in zip(baselines, theirs, strict=True)}
+    names = [one.name for one in baselines]
+    (overall, groups), *others = average_methods(store, scored, ["", *names], spread).values()
+    beside = {name: mean for name, (mean, _) in zip(names, others, strict=True)}
     return Evaluation(spread, overall, groups, missing, converted, beside)
+
+
+COLUMNS = ("coords", "feats", "properties", "material", "valid")
+"""The arrays of an asset that a baseline is fitted to."""
+
+Rows = Mapping[str, NDArray[Any]]
+"""Those arrays by name, as `Store.read` returns them."""
+
+
+@dataclass(frozen=True)
+class VoxelBaseline:
+    """Targets as a linear function of a voxel's inputs.
+
+    Attributes
+    ----------
+    name : str
+        What tables and pictures call it.
+    weights : ndarray of float64, shape (channels + 4, P + classes)
+        From latents, position and 1 to properties and class indicators.
+    properties : int
+        Number of properties P.
+    """
+
+    name: str
+    weights: NDArray[np.float64]
+    properties: int
+
+    def predict(self, rows: Rows) -> VoxelPrediction:
+        """Return properties (N, P), within [-1, 1], and classes (N,) if there are any."""
+        outputs = _inputs(rows) @ self.weights
+        properties, classes = np.split(outputs, [self.properties], axis=1)
+        material = classes.argmax(axis=1) if classes.size else None
+        return VoxelPrediction(np.clip(properties, -1, 1), material)
+
+
+def fit_baselines(store: Store, assets: Iterable[int]) -> tuple[VoxelBaseline, VoxelBaseline]:
+    """Fit both reference models to assets in one pass; all valid voxels weigh the same.
+
+    The first gives the mean and the most frequent class of all voxels, the second is a
+    least-squares fit.
+    """
+    contents = store.contents
+    size, count = contents.latents.channels + 4, len(contents.properties)
+    squares = np.zeros((size, size))
+    products = np.zeros((size, count + contents.n_classes))
+    for index in assets:
+        rows = store.read(index, COLUMNS)
+        valid = rows["valid"]
+        inputs, targets = _inputs(rows)[valid], _targets(rows, contents.n_classes)[valid]
+        squares += inputs.T @ inputs
+        products += inputs.T @ targets
+    # The last input is 1, so its products are the sum of the targets and the count.
+    mean = np.zeros_like(products)
+    mean[-1] = products[-1] / squares[-1, -1]
+    linear = np.linalg.lstsq(squares, products, rcond=None)[0]
+    return (
+        VoxelBaseline("mean of the training voxels", mean, count),
+        VoxelBaseline("linear in each voxel", np.asarray(linear, np.float64), count),
+    )
+
+
+def _inputs(rows: Rows) -> NDArray[np.float64]:
+    # Of another grid than 64^3 on another scale, which the weights make up for.
+    position = voxel_centres(rows["coords"])
+    return np.hstack([rows["feats"], position, np.ones((len(position), 1))])
+
+
+def _targets(rows: Rows, classes: int) -> NDArray[np.float64]:
+    return np.hstack([rows["properties"], rows["material"][:, None] == np.arange(classes)])

@@ -17,10 +17,9 @@ from torch.nn import functional
 
 from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation
-from slatprep.learn.baselines import COLUMNS, VoxelBaseline, fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
-from slatprep.learn.metrics import score_asset
+from slatprep.learn.metrics import COLUMNS, VoxelBaseline, fit_baselines, score_asset
 from slatprep.learn.predict import (
     Checkpoint,
     checkpoint_state,

@@ -33,9 +33,11 @@ _SPECS = {
     "material": ArraySpec(shapes=((None,),), kinds="iu"),
 }
 _PROPERTIES = ArraySpec(shapes=((None, 3),), kinds="f")
-_VALID = ArraySpec(shapes=((None,),), kinds="b")
-_SIDE = ArraySpec(shapes=((),), kinds="iu")
-_ANY = ArraySpec(shapes=(), kinds="biuf", max_items=16 * RESOLUTION**3)
+_MORE = {
+    "properties_si": _PROPERTIES,
+    "valid": ArraySpec(shapes=((None,),), kinds="b"),
+    "resolution": ArraySpec(shapes=((),), kinds="iu"),
+}
 
 
 @dataclass(frozen=True)
@@ -100,18 +102,15 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     """
     data, _ = load_source(path, path.parent, "slat")
     arrays = npz_arrays(data, path, _SPECS)
-    held = npz_small_arrays(data, path, _ANY)[0]
-    side = RESOLUTION
-    if "resolution" in held:
-        side = int(npz_arrays(data, path, {"resolution": _SIDE})["resolution"])
+    arrays |= npz_arrays(data, path, _MORE, partial=True)
+    side = int(arrays.get("resolution", RESOLUTION))
     if not 2 <= side <= MAX_LATENT_RESOLUTION:
         raise InputError(path, f"has a grid of {side}^3", f"2 to {MAX_LATENT_RESOLUTION} a side")
     coords = check_coords(arrays["coords"], path, side)
     material = arrays["material"]
     _check_columns(path, data)
-    if "properties_si" in held:
-        values = npz_arrays(data, path, {"properties_si": _PROPERTIES})["properties_si"]
-    else:
+    values = arrays.get("properties_si")
+    if values is None:
         values = npz_arrays(data, path, {"properties": _PROPERTIES})["properties"]
         if normalization is None:
             raise ConfigError(
@@ -119,9 +118,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
                 "(--store or --ranges), or save SI values as properties_si"
             )
         values = denormalize_properties(values, normalization)
-    valid = np.ones(len(coords), dtype=bool)
-    if "valid" in held:
-        valid = npz_arrays(data, path, {"valid": _VALID})["valid"]
+    valid = arrays.get("valid", np.ones(len(coords), dtype=bool))
     lengths = {len(coords), len(material), len(values), len(valid)}
     if len(lengths) > 1 or not valid.any():
         raise InputError(

@@ -125,13 +125,6 @@ def simulate_motion(
     return Motion(moved, np.stack(gradients))
 
 
-def simulate(
-    positions: ArrayLike, material: ArrayLike, properties: ArrayLike, spacing: float, **how: Any
-) -> NDArray[np.float64]:
-    """Return the positions (F, N, 3) of `simulate_motion`, which takes the same."""
-    return simulate_motion(positions, material, properties, spacing, **how).positions
-
-
 def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[np.float64]:
     """Return the area (N,) of the free faces of particles on a lattice, as the wind (3,) sees them.
 

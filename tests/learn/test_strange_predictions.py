@@ -17,10 +17,9 @@ from support.commands import refused
 
 from slatprep.errors import InputError, StoreError
 from slatprep.learn.metrics import evaluate_store
-from slatprep.learn.predictions import check_prediction, selection_of_run
+from slatprep.learn.predictions import check_prediction, read_array, selection_of_run
 from slatprep.learn.runs import LAST
 from slatprep.learn.train import TrainParameters, train
-from slatprep.learn.zarr_arrays import read_array
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.readers.files import ArraySpec
 from slatprep.readers.splits import Shares

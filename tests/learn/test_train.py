@@ -16,9 +16,9 @@ from support.synthetic import Dataset, make_asset
 
 from slatprep import ConfigError, InputError, StoreError, build_store, open_store
 from slatprep.learn import train as module
-from slatprep.learn.baselines import fit_baselines
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
+from slatprep.learn.metrics import fit_baselines
 from slatprep.learn.runs import BEST, LAST, Run
 from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
 from slatprep.readers.splits import Shares, split_of

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from slatprep.errors import SlatprepError
-from slatprep.particles.simulate import AIR, rigid_deviation, simulate, strain, windward
+from slatprep.particles.simulate import AIR, rigid_deviation, simulate_motion, strain, windward
 
 SPACING = 0.1
 CUBE = np.argwhere(np.ones((4, 4, 4))) * SPACING
@@ -65,7 +65,7 @@ def test_a_ratio_of_one_half_is_taken_and_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "newton", None)  # It is told before the engine is loaded.
     told = pytest.warns(UserWarning, match="nu of 7 particles is taken as 0.499")
     with told, pytest.raises(SlatprepError, match="simulation needs the package"):
-        simulate(CUBE, ONE_PART, stuff, SPACING)
+        simulate_motion(CUBE, ONE_PART, stuff, SPACING)
 
 
 @pytest.mark.parametrize(
@@ -82,13 +82,13 @@ def test_particles_that_cannot_be_simulated_are_named(material, change, said):
     if change:
         stuff[change[0], change[1]] = change[2]
     with pytest.raises(SlatprepError, match=said):
-        simulate(CUBE, ONE_PART + material, stuff, SPACING)
+        simulate_motion(CUBE, ONE_PART + material, stuff, SPACING)
 
 
 def test_without_newton_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "newton", None)
     with pytest.raises(SlatprepError, match=r"pip install 'slatprep\[simulate\]'"):
-        simulate(CUBE, ONE_PART, STUFF, SPACING)
+        simulate_motion(CUBE, ONE_PART, STUFF, SPACING)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -119,7 +119,9 @@ def test_water_runs_sand_slumps_snow_packs_and_jelly_stands():
     positions = np.concatenate([column + np.array([3.0 * k, 0, 0]) for k in range(len(kinds))])
     material = np.repeat(list(kinds), len(column))
     stuff = np.repeat(list(kinds.values()), len(column), axis=0)
-    frames = simulate(positions, material, stuff, SPACING, height=0.1, seconds=0.8, substeps=1)
+    frames = simulate_motion(
+        positions, material, stuff, SPACING, height=0.1, seconds=0.8, substeps=1
+    ).positions
     assert (frames[..., 2] > -SPACING / 2).all()  # none in the ground
     water, sand, snow, jelly = (frames[-1][material == number] for number in kinds)
     heights = [np.percentile(part[:, 2], 90) for part in (water, sand, snow, jelly)]
@@ -134,10 +136,10 @@ def test_steps_too_long_for_the_speed_are_said():
     stuff = np.tile([1e5, 1e3, 0.3], (len(CUBE), 1))
     how = {"height": 1.0, "seconds": 0.6, "rate": 15}
     with pytest.warns(UserWarning, match=r"cross 1\.[0-9] cells in a time step.*--substeps 2"):
-        simulate(CUBE, ONE_PART, stuff, SPACING, substeps=1, **how)
+        simulate_motion(CUBE, ONE_PART, stuff, SPACING, substeps=1, **how)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        simulate(CUBE, ONE_PART, stuff, SPACING, substeps=2, **how)
+        simulate_motion(CUBE, ONE_PART, stuff, SPACING, substeps=2, **how)
 
 
 @needs_newton
@@ -145,9 +147,9 @@ def test_wind_pushes_by_the_drag_equation():
     """m dv/dt = 1/2 rho A (U - v)^2, of which the way has a closed form."""
     wind, density, seconds, side = 10.0, 20.0, 0.25, 4 * SPACING
     stuff = np.tile([1e5, density, 0.3], (len(CUBE), 1))
-    frames = simulate(
+    frames = simulate_motion(
         CUBE, ONE_PART, stuff, SPACING, height=0.5, wind=(wind, 0, 0), seconds=seconds, substeps=1
-    )
+    ).positions
     rate = AIR / 2 * side**2 * wind / (density * side**3)  # 1/s
     expected = wind * seconds - wind / rate * np.log(1 + rate * seconds)
     np.testing.assert_allclose((frames[-1] - frames[0])[:, 0].mean(), expected, rtol=0.1)
@@ -158,10 +160,10 @@ def test_a_held_pole_sways_about_where_a_beam_would_rest():
     """Euler and Bernoulli: a cantilever under an even load bends by q L^4 / (8 E I)."""
     pole, wind, modulus = np.argwhere(np.ones((3, 3, 12))) * SPACING, 20.0, 1e6
     foot = pole[:, 2] < SPACING / 2
-    frames = simulate(
+    frames = simulate_motion(
         pole, np.zeros(len(pole), dtype=int), np.tile([modulus, 1e3, 0.3], (len(pole), 1)), SPACING,
         height=0.0, gravity=0.0, wind=(wind, 0, 0), fixed=foot, seconds=0.8, rate=30,
-    )  # fmt: skip
+    ).positions  # fmt: skip
     moved = frames - frames[0]
     assert abs(moved[:, foot]).max() < 1e-6  # the engine computes in single precision
     width, length = 3 * SPACING, 11 * SPACING
@@ -177,7 +179,9 @@ def test_steel_on_jelly_falls_as_galileo_says_and_the_jelly_gives_way():
     tower = np.argwhere(np.ones((6, 6, 9))) * SPACING
     top = tower[:, 2] > 5.5 * SPACING
     stuff = np.where(top[:, None], [6e10, 7e3, 0.3], [6e4, 1e3, 0.4])
-    frames = simulate(tower, top.astype(int), stuff, SPACING, height=0.2, seconds=0.35)
+    frames = simulate_motion(
+        tower, top.astype(int), stuff, SPACING, height=0.2, seconds=0.35
+    ).positions
     for frame in (6, 10):  # still falling: g t^2 / 2
         fallen = (frames[0] - frames[frame])[:, 2]
         np.testing.assert_allclose(fallen, 9.81 / 2 * (frame / 60) ** 2, rtol=0.15)
