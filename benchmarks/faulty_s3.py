@@ -49,6 +49,7 @@ from slatprep.cli.commands import slatprep
 from slatprep.errors import SlatprepError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
+from slatprep.storage.place import place_of
 from slatprep.store import Store, open_store
 
 SECONDS_A_RUN = 300
@@ -208,11 +209,11 @@ def _first(bench: Bench) -> str:
 
 
 def _sources(bench: Bench) -> str:
-    place = f"s3://{BUCKET}/data"
+    place = place_of(f"s3://{BUCKET}/data")
     parameters = replace(
         bench.new.parameters("pixie"),
-        pixieverse=PixieverseSource(f"{place}/pixieverse"),
-        slat=SlatSource(f"{place}/slat"),
+        pixieverse=PixieverseSource(place / "pixieverse"),
+        slat=SlatSource(place / "slat"),
     )
     out = bench.out / "s.zarr"
     if bench.chance.random() < 0.5:

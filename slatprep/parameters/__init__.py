@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le, MaxLen
 
-from slatprep.records import Engine, Place, Plausibility, Share, Units
+from slatprep.records import Engine, InJson, Place, Plausibility, Share, Units
 from slatprep.storage.place import place_of
 
 Length = Annotated[float, Gt(1e-4), Le(1e3)]
@@ -42,15 +42,8 @@ class _Group:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
-class _Text:
-    """Has pydantic take a place as text; the group itself then makes the place."""
-
-    @staticmethod
-    def __get_pydantic_core_schema__(_source: Any, handler: Any) -> Any:
-        return handler(str)
-
-
-PlaceText = Annotated[Place, _Text]
+PlaceText = Annotated[Place, InJson({"type": "str"}, place_of)]
+"""A place, which is a text in files."""
 
 Samples = Literal["one", "first", "all", "merge"]
 """The treatment of several annotations of an object, see `PixieverseSource`."""
@@ -89,7 +82,6 @@ class PixieverseSource(_Group):
     plausibility: Plausibility = "refuse"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "root", place_of(self.root))
         if self.sample and self.samples != "one":
             raise ValueError("samples = 'one' where `sample` names the one to take")
 
@@ -122,9 +114,6 @@ class SlatSource(_Group):
     encoder: str = "trellis"
     standardised: Literal["auto", "yes", "no"] = "auto"
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "root", place_of(self.root))
-
 
 @dataclass(frozen=True)
 class PairingParameters(_Group):
@@ -137,11 +126,6 @@ class PairingParameters(_Group):
 
     map: PlaceText | None = None
     categories: PlaceText | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("map", "categories"):
-            place = getattr(self, name)
-            object.__setattr__(self, name, None if place is None else place_of(place))
 
 
 @dataclass(frozen=True)

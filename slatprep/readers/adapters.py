@@ -108,7 +108,7 @@ def source_adapter(name: str) -> SourceAdapter:
 
 def latent_adapter(name: str) -> LatentAdapter | None:
     """Return the latent adapter of a name, or None; ConfigError if it does not load."""
-    if name not in {**LATENTS, **_others("slatprep.latents")}:
+    if name not in _known("slatprep.latents"):
         return None
     adapter: LatentAdapter = _loaded("slatprep.latents", name)
     return adapter
@@ -116,42 +116,37 @@ def latent_adapter(name: str) -> LatentAdapter | None:
 
 def adapter_names(group: str) -> tuple[str, ...]:
     """Return the names of a group, ``slatprep.sources`` or ``slatprep.latents``."""
-    return (*_OWN[group], *_others(group))
+    return tuple(_known(group))
 
 
 def made_by(group: str, name: str) -> str:
     """Return the package of an adapter and its version; empty for slatprep's own."""
-    return "" if name in _OWN[group] else _others(group).get(name, ("", ""))[1]
-
-
-_OWN: Mapping[str, Mapping[str, str]] = {"slatprep.sources": SOURCES, "slatprep.latents": LATENTS}
+    return _known(group).get(name, ("", None))[1] or ""
 
 
 @lru_cache(maxsize=64)
 def _loaded(group: str, name: str) -> Any:
-    others = {} if name in _OWN[group] else _others(group)
-    if name not in _OWN[group] and name not in others:
+    if name not in _known(group):
         known = ", ".join(adapter_names(group))
         raise ConfigError(f"there is no adapter {name!r}; expected {known}, or install its package")
-    where = _OWN[group].get(name) or others[name][0]
+    where, package = _known(group)[name]
     try:
         made: Callable[[], Any] = pkgutil.resolve_name(where)
         adapter = made()
     except (Exception, SystemExit) as error:  # Another package's code may raise anything.
         raise ConfigError(f"adapter {name!r} ({where}) cannot be loaded: {error!r}") from error
-    if name in _OWN[group]:
-        return adapter
-    return guarded(group, adapter, name, others[name][1] or where)
+    return adapter if package is None else guarded(group, adapter, name, package or where)
 
 
 @lru_cache(maxsize=2)
-def _others(group: str) -> dict[str, tuple[str, str]]:
-    """Return where other packages keep their adapters, and name and version of each package."""
-    return {
-        point.name: (point.value, f"{point.dist.name} {point.dist.version}" if point.dist else "")
-        for point in entry_points(group=group)
-        if point.name not in _OWN[group]
-    }
+def _known(group: str) -> dict[str, tuple[str, str | None]]:
+    """Return where each adapter of a group lies, and its package; None for slatprep's own."""
+    own = SOURCES if group == "slatprep.sources" else LATENTS
+    known: dict[str, tuple[str, str | None]] = {name: (own[name], None) for name in own}
+    for point in entry_points(group=group):
+        package = f"{point.dist.name} {point.dist.version}" if point.dist else ""
+        known.setdefault(point.name, (point.value, package))
+    return known
 
 
 def patterns_of(adapter: SourceAdapter, source: PixieverseSource) -> Sequence[str]:

@@ -25,33 +25,24 @@ def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str
     """Hash the files of a pair, in the order in which the readers name them.
 
     Returns what `read_field` and `read_latents` would record as sources, and their digests by
-    role. InputError if a file cannot be read.
+    role. Of several annotations of an object, those that can be read are hashed. InputError if
+    there is none.
     """
-    if pair.others:
-        return _hash_several(pair)
-    grid, slat = require_complete(pair)
-    sources = _hash_annotation(pair, grid)
-    latents, files = _hash_slat(pair, slat)
-    sources += files
-    return tuple(sources), source_digests(sources, latents) | reading_of(pair.roots)
-
-
-def _hash_several(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
-    """Hash those of an object's annotations that can be read."""
     sources: list[SourceFile] = []
     digests: dict[str, str] = {}
     faults: list[InputError] = []
     found: Place | None = None
     for one in pair.annotations:
+        label = f" {one.sample}" if pair.others else ""
         try:
             grid, slat = require_complete(one)
             own, found = _hash_annotation(one, grid), slat
         except InputError as error:
             faults.append(error)
-            digests[f"grid {one.sample}"] = "unreadable"
+            digests[f"grid{label}"] = "unreadable"
             continue
         for role, digest in (source_digests(own) | reading_of(one.roots)).items():
-            digests[f"{role} {one.sample}"] = digest
+            digests[role + label] = digest
         sources += [file for file in own if file not in sources]
     if found is None:
         raise faults[0]
@@ -59,17 +50,16 @@ def _hash_several(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, st
     return (*sources, *files), digests | source_digests(files, latents)
 
 
-def _hash_annotation(pair: AssetPair, grid: Place) -> list[SourceFile]:
-    root = pair.roots.pixieverse
-    files = [(grid, "grid")] + ([(pair.mask, "mask")] if pair.mask else [])
-    sources = [load_source(path, root, role)[1] for path, role in files]
-    if pair.bounds:
-        with suppress(InputError):  # Not needed: the reader goes on without it, too.
-            sources.append(load_source(pair.bounds, root, "bounds")[1])
-    sources += [load_source(path, root, "description")[1] for path in pair.beside]
-    if pair.transform:
-        sources.append(load_source(pair.transform, root, "transform")[1])
-    return list(pair.roots.numbered(sources))
+def _hash_annotation(pair: AssetPair, grid: Place) -> tuple[SourceFile, ...]:
+    files = [(grid, "grid"), (pair.mask, "mask"), (pair.bounds, "bounds")]
+    files += [(path, "description") for path in pair.beside]
+    sources = []
+    for path, role in (*files, (pair.transform, "transform")):
+        # Bounds are not needed: the reader goes on without them, too.
+        with suppress(*([InputError] if role == "bounds" else [])):
+            if path:
+                sources.append(load_source(path, pair.roots.pixieverse, role)[1])
+    return pair.roots.numbered(sources)
 
 
 def _hash_slat(

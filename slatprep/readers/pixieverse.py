@@ -19,7 +19,7 @@ from slatprep.geometry.voxels import voxels_of
 from slatprep.parameters import PixieverseSource, SampleParameters
 from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern
-from slatprep.readers.values import in_si, require_plausible, require_possible, require_prediction
+from slatprep.readers.values import require_plausible, require_possible, require_prediction
 from slatprep.readers.voxel_sets import half_overflow, physical_rows
 from slatprep.records import (
     BACKGROUND,
@@ -108,9 +108,8 @@ def read_grid(
     voxels = voxels_of(annotated)
     properties, classes = _gather(channels, annotated), material[annotated]
     if raw:
-        in_si(properties, PROPERTIES, pair.roots.units)
-        told_of = properties, classes, PROPERTIES, MATERIAL_CLASSES
-        warnings += require_plausible(path, *told_of, pair.roots)
+        held = properties, classes, PROPERTIES, MATERIAL_CLASSES
+        warnings += require_plausible(path, *held, pair.roots)
     else:
         warnings += require_prediction(path, properties, classes, pair.roots.plausibility)
 

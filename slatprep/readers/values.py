@@ -47,10 +47,8 @@ _FEW = 0.05
 """A class with a smaller share of the voxels does not count."""
 
 
-def in_si(
-    values: NDArray[np.float32], table: Sequence[Property], units: Units
-) -> NDArray[np.float32]:
-    """Return values (K, P) in SI units where a unit is stated for a column of SI units."""
+def _bring_to_si(values: NDArray[np.float32], table: Sequence[Property], units: Units) -> None:
+    """Bring values (K, P) to SI units, in place, where a unit is stated for a column of those."""
     for column, one in enumerate(table):
         unit = units.of(one.name)
         if not unit or FACTORS.get(one.unit) != 1.0:
@@ -59,7 +57,6 @@ def in_si(
             own = values[:, column].astype(np.float64)
             own = 10.0**own if unit.startswith(LOG10) else own * FACTORS[unit]
             values[:, column] = own.astype(np.float32)
-    return values
 
 
 def require_plausible(
@@ -70,11 +67,13 @@ def require_plausible(
     classes: Sequence[str],
     roots: SourceRoots,
 ) -> list[str]:
-    """Hold values (K, P) in SI units and classes (K,) against what materials have.
+    """Bring values (K, P) to SI units, in place; hold them and classes (K,) against materials.
 
-    Returns what a person should know; raises `InputError` where most voxels cannot be and
-    `roots.plausibility` is ``refuse``. Values that are none, such as NaN, are left to the reader.
+    `roots` say what units the values have. Returns what a person should know; raises `InputError`
+    where most voxels cannot be and `roots.plausibility` is ``refuse``. Values that are none, such
+    as NaN, are left to the reader.
     """
+    _bring_to_si(values, table, roots.units)
     if roots.plausibility == "off" or len(values) == 0:
         return []
     parts = _parts(values, material, table, classes)

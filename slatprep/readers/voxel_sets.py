@@ -12,7 +12,7 @@ from slatprep import records
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import voxels_of
 from slatprep.normalize import from_mapped, to_mapped
-from slatprep.readers.values import in_si, require_plausible
+from slatprep.readers.values import require_plausible
 
 MAX_RESOLUTION = 512
 
@@ -57,7 +57,6 @@ def field_of_voxels(
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
     if roots is not None:
-        in_si(values, table, roots.units)
         labels = None if material is None else own
         notes += require_plausible(where, values, labels, table, names, roots)
     fine = np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)

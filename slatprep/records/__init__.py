@@ -33,6 +33,7 @@ from slatprep.records.json_types import (
     Rotation,
     Share,
     Transform,
+    one_of,
 )
 from slatprep.records.results import (
     Annotation,

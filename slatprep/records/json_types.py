@@ -10,7 +10,7 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InJson:
     """How pydantic reads an annotated field: by a core schema, and a function on its result."""
 
@@ -64,8 +64,9 @@ _MAX_SIDE = 32
 _FINITE = {"type": "float", "allow_inf_nan": False}
 
 
-def _one_of(*words: str) -> InJson:
-    return InJson({"type": "literal", "expected": list(words)})
+def one_of(*values: object) -> InJson:
+    """Return how to read a field that is one of several values."""
+    return InJson({"type": "literal", "expected": list(values)})
 
 
 def _null_is_nan(value: float | None) -> float:

@@ -10,7 +10,7 @@ from typing import IO, Annotated, Any, ClassVar, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.records.json_types import Count, Digest, _one_of
+from slatprep.records.json_types import Count, Digest, one_of
 from slatprep.records.tables import PIXIEVERSE, PROPERTIES, Contents, LatentMoments, Property
 from slatprep.records.words import RESOLUTION
 
@@ -79,7 +79,7 @@ class SourceFile:
     `slatprep.parameters.BuildParameters.also`.
     """
 
-    role: Annotated[str, _one_of(*ROLES)]
+    role: Annotated[str, one_of(*ROLES)]
     path: str
     size: Count
     sha256: Digest

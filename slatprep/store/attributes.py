@@ -17,10 +17,6 @@ from slatprep.store.layout import FORMAT, FORMAT_VERSION
 from slatprep.store.record_json import adapter_of
 
 
-def _one_of(*values: object) -> records.InJson:
-    return records.InJson({"type": "literal", "expected": list(values)})
-
-
 @dataclass(frozen=True)
 class StoredRange:
     """The range of one property; see `slatprep.records.PropertyRange`."""
@@ -75,9 +71,9 @@ class RootAttributes:
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "ignore", "allow_inf_nan": False}
 
-    format: Annotated[str, _one_of(FORMAT)]
-    format_version: Annotated[int, _one_of(FORMAT_VERSION)]
-    resolution: Annotated[int, _one_of(records.RESOLUTION)]
+    format: Annotated[str, records.one_of(FORMAT)]
+    format_version: Annotated[int, records.one_of(FORMAT_VERSION)]
+    resolution: Annotated[int, records.one_of(records.RESOLUTION)]
     material_classes: tuple[records.ClassName, ...]
     property_columns: Annotated[
         tuple[records.PropertyName, ...], MinLen(1), MaxLen(records.MAX_PROPERTIES)

@@ -8,7 +8,6 @@ digests. ``slatprep/store/schema`` holds the JSON Schemas, which
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Annotated, ClassVar, Final, Literal
@@ -30,6 +29,7 @@ from slatprep.records import (
     SourceFile,
     Status,
     Verdict,
+    one_of,
 )
 
 RECORD_VERSION: Final = 1
@@ -217,10 +217,6 @@ class BuildCounts:
     """PixieVerse voxels with a class, but properties that no material has."""
 
 
-def _word(words: Iterable[str]) -> InJson:
-    return InJson({"type": "literal", "expected": [str(word) for word in words]})
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BuildRecord:
     """One build of a store, over its asset records."""
@@ -249,9 +245,9 @@ class BuildRecord:
     """Versions of slatprep and of its libraries."""
     normalization: Normalization
     """The ranges of the properties."""
-    statuses: dict[Annotated[str, _word(Status)], Count]
+    statuses: dict[Annotated[str, one_of(*map(str, Status))], Count]
     """Assets by status."""
-    verdicts: dict[Annotated[str, _word(Verdict)], Count]
+    verdicts: dict[Annotated[str, one_of(*map(str, Verdict))], Count]
     """Assets in the store by verdict."""
     counts: BuildCounts
     """Voxels of the store."""

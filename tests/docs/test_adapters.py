@@ -32,10 +32,10 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     name, value = re.findall(r'^(\w+) = "(mine:\w+)"$', "\n".join(blocks("toml")), re.M)[0]
     (about / "entry_points.txt").write_text(f"[slatprep.sources]\n{name} = {value}\n")
     monkeypatch.syspath_prepend(str(site))
-    adapters._others.cache_clear()
+    adapters._known.cache_clear()
     adapters._loaded.cache_clear()
     yield
-    adapters._others.cache_clear()
+    adapters._known.cache_clear()
     adapters._loaded.cache_clear()
 
 

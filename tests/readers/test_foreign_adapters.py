@@ -182,10 +182,10 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
         f"[slatprep.sources]\n{lines}[slatprep.latents]\n{lines}"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    for cached in (adapters._others, adapters._loaded):
+    for cached in (adapters._known, adapters._loaded):
         cached.cache_clear()
     yield
-    for cached in (adapters._others, adapters._loaded):
+    for cached in (adapters._known, adapters._loaded):
         cached.cache_clear()
 
 
