@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import BACKGROUND, PROPERTIES
-from slatprep.storage.ply import write_ply
+from slatprep.storage.arrays import write_ply
 
 Source = Literal[
     "pixieverse", "pixie-predictions", "pixie-prediction-ids",

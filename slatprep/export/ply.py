@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.errors import StoreError
 from slatprep.export.formats import Exported, ExportOptions, Frame, Points, Writer, annotated_points
 from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
+from slatprep.storage.arrays import write_ply
 from slatprep.storage.files import file_name
-from slatprep.storage.ply import write_ply
 from slatprep.store import Store, StoredAsset
 from slatprep.store.records import StoredRecords
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.particles.read import SAVED_AXES, Axes
 from slatprep.records import MATERIAL_COLOURS
-from slatprep.storage.ply import write_ply
+from slatprep.storage.arrays import write_ply
 
 _NEAREST = 8
 """Particles that carry a Gaussian; a particle of a cubic lattice has eight around each cell."""

@@ -32,9 +32,8 @@ from pathlib import Path
 from slatprep.errors import StoreError
 from slatprep.pipeline.spool import Spool
 from slatprep.records import Place
-from slatprep.storage.atomic import restore_directory, writing
+from slatprep.storage.atomic import restore_directory, take_lock, writing
 from slatprep.storage.faults import reached
-from slatprep.storage.lock import take_lock
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, SPOOL, is_spooled, new_version
 

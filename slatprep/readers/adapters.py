@@ -81,7 +81,7 @@ class LatentAdapter(Protocol):
 SOURCES = {
     "pixieverse": "slatprep.readers.pixieverse:PixieVerse",
     "voxels": "slatprep.readers.voxels:PlainVoxels",
-    "vomp": "slatprep.readers.vomp:VoMP",
+    "vomp": "slatprep.readers.voxels:VoMP",
     "physxnet": "slatprep.readers.physxnet:PhysXNet",
     "parts": "slatprep.readers.parts:Parts",
 }

@@ -4,11 +4,16 @@
 
     {"properties": [{"name": "yield_stress", "unit": "Pa", "scale": "log10"}, ...],
      "classes": ["wood", "steel"], "resolution": 64, "aligned": true}
+
+VoMP's dataset needs none: voxels with materials as a structured array, of meshes without classes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import io
+import json
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
@@ -18,14 +23,14 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from numpy.typing import NDArray
 
 from slatprep import records
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
-from slatprep.readers.zarr_groups import group_arrays
+from slatprep.storage.chunks import array_form, read_chunks
 from slatprep.storage.documents import read_bounded
 from slatprep.storage.files import Listing
 
@@ -112,7 +117,7 @@ class PlainVoxels:
         else:
             data, file = files.load_source(path, root, "grid")
             if files.is_hierarchy(path):
-                arrays = group_arrays(data, path, specs, said.empty_chunks)
+                arrays = _group_arrays(data, path, specs, said.empty_chunks)
             else:
                 read = _ply_arrays if path.suffix.lower() == ".ply" else files.npz_arrays
                 arrays = read(data, path, specs)
@@ -184,3 +189,113 @@ def _description(root: records.Place) -> _Description:
             f"{path}: cannot be read ({error}); expected a file that says what the columns are"
         ) from None
     return _parsed(text, str(path))
+
+
+_MAX_METADATA = 2**16
+_ZARR_EXPECTED = (
+    "a Zarr group of format 3 with an array for each of {}, not in shards, packed with zstd, "
+    "blosc or nothing; or npz, HDF5 or PLY"
+)
+
+_ALL_CHUNKS = (
+    'all chunks, as zarr writes them with config={{"write_empty_chunks": True}}; where those left '
+    'out hold the fill value, say "empty_chunks": ["{}"] in source.json'
+)
+
+
+def _group_arrays(
+    data: bytes,
+    where: str | records.Place,
+    specs: Mapping[str, files.ArraySpec],
+    empty: Collection[str] = (),
+) -> dict[str, NDArray[Any]]:
+    """Read the named arrays of a group from the archive of `slatprep.readers.files.load_source`.
+
+    Errors call it `where`. Of the arrays in `empty` chunks may be missing, which then hold the fill
+    value. InputError if an array is missing, not as specified, lacks a chunk, or uses another
+    compression.
+    """
+    expected = _ZARR_EXPECTED.format(", ".join(specs))
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return {
+            name: _array(archive, f"{where} [{name}]", name, spec, expected, name in empty)
+            for name, spec in specs.items()
+        }
+
+
+def _array(
+    archive: zipfile.ZipFile,
+    where: str,
+    name: str,
+    spec: files.ArraySpec,
+    expected: str,
+    empty: bool,
+) -> NDArray[Any]:
+    def fetch(key: str, most: int) -> bytes | None:
+        try:
+            chunk = archive.getinfo(f"{name}/{key}")
+        except KeyError:
+            if empty or key == "zarr.json":
+                return None
+            raise InputError(
+                where, f"its chunk {name}/{key} is missing", _ALL_CHUNKS.format(name)
+            ) from None
+        if chunk.file_size > most:
+            raise ValueError(f"{key} has {chunk.file_size} bytes")
+        return archive.read(chunk)
+
+    with files.refusing(where, "is no readable array", expected):
+        text = fetch("zarr.json", _MAX_METADATA)
+        if text is None:
+            raise InputError(where, "is not in it", expected)
+        metadata = json.loads(text)
+        spec.check(where, *array_form(metadata))
+        try:
+            return read_chunks(metadata, fetch)
+        except StoreError as error:
+            raise ValueError(str(error)) from None
+
+
+_VOMP = {"voxel_data": files.ArraySpec(shapes=((None,),), kinds="V")}
+_VOMP_SIDE = 64
+
+
+class VoMP:
+    """``voxels/<id>_with_materials.npz``: x, y, z in the unit cube, E, density and nu in SI units.
+
+    A SLAT encoded from the same mesh lies in the same frame. The field records this frame, and
+    the engine ``known`` uses it.
+    """
+
+    patterns = ("voxels/{id}_with_materials.npz", "{id}_with_materials.npz")
+
+    def describe(self, source: PixieverseSource) -> Holding:
+        """Say that there are PixieVerse's three properties and no classes."""
+        return Holding(records.PROPERTIES, ())
+
+    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
+        """Find the fields by the names of their files."""
+        return find_by_pattern(patterns_of(self, source), listing, {})
+
+    def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
+        """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
+        path, _ = files.require_complete(pair)
+        data, file = files.load_source(path, pair.roots.pixieverse, "grid")
+        rows = files.npz_arrays(data, path, _VOMP)["voxel_data"]
+        columns = tuple(one.name for one in records.PROPERTIES)
+        missing = {"x", "y", "z", *columns} - set(rows.dtype.names or ())
+        if missing or any(rows.dtype[name].kind not in "fiu" for name in (*"xyz", *columns)):
+            wanted = f"numbers named x, y, z, {', '.join(columns)}"
+            raise InputError(f"{path} [voxel_data]", f"has the columns {rows.dtype}", wanted)
+        positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        return field_of_voxels(
+            path,
+            # The dataset states lower corners, i / 64 - 0.5; predictions state centres.
+            np.floor((positions + 0.5) * _VOMP_SIDE + 0.25).astype(np.int64),
+            np.stack([rows[name] for name in columns], axis=1),
+            resolution=_VOMP_SIDE,
+            max_unphysical=max_unphysical,
+            sources=(file,),
+            frame=np.eye(4),
+            roots=pair.roots,
+        )

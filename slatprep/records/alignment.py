@@ -18,8 +18,7 @@ from slatprep.records.json_types import (
     Share,
     Transform,
 )
-from slatprep.records.tables import MAX_PROPERTIES
-from slatprep.records.words import Engine, Model, Search, Verdict
+from slatprep.records.tables import MAX_PROPERTIES, Engine, Model, Search, Verdict
 
 MAX_CANDIDATES = 4096
 """Candidates and placements of one alignment; engines try a few hundred starts."""

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from slatprep.records.alignment import Alignment, Judgement
 from slatprep.records.json_types import Count
 from slatprep.records.sources import AssetPair, MaterialField, SourceFile, StructuredLatents
-from slatprep.records.tables import MAX_PROPERTIES, PropertyName
-from slatprep.records.words import Status
+from slatprep.records.tables import MAX_PROPERTIES, PropertyName, Status
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records.json_types import Count, Digest, one_of
-from slatprep.records.tables import PIXIEVERSE, PROPERTIES, Contents, LatentMoments, Property
-from slatprep.records.words import RESOLUTION
+from slatprep.records.tables import (
+    PIXIEVERSE,
+    PROPERTIES,
+    RESOLUTION,
+    Contents,
+    LatentMoments,
+    Property,
+)
 
 
 class Place(Protocol):

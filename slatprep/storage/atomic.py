@@ -1,7 +1,8 @@
-"""Put a new directory in the place of an old one, in one step where the system can.
+"""Write what readers and other processes must never see half done: exchanges, stages, locks.
 
-The exchange comes after all of the new one is on the disk. After a power failure, either the old
-one or the new one is there and complete.
+A new directory takes the place of an old one in one step where the system can, after all of it is
+on the disk. After a power failure, either the old one or the new one is there and complete. A lock
+ends with its holder, however that ends.
 """
 
 from __future__ import annotations
@@ -9,13 +10,18 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import platform
 import secrets
 import shutil
+import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import orjson
 
 from slatprep.errors import StoreError
 from slatprep.storage.faults import reached
@@ -23,6 +29,7 @@ from slatprep.storage.files import OWN_FILE, is_at, is_only_ours, locks_alone
 
 if TYPE_CHECKING:
     from slatprep.records import Place
+
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -162,3 +169,69 @@ def writing(what: str, where: Place) -> Iterator[None]:
             f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "
             f"replaced. {advice} and run again: what is finished is kept"
         ) from error
+
+
+_TRIES = 100
+"""Attempts to lock a file that its holder has just removed."""
+
+
+def take_lock(path: Path, taken: str) -> int:
+    """Return a descriptor that holds a lock until it is closed or the process ends.
+
+    The file and its folder are created; the holder may remove the file. StoreError if another
+    process holds it, with that process and the words of `taken`, such as ``STORE: another build is
+    writing it``; also if the file is no lock, or its folder vanishes. OSError if it cannot be
+    written, or is a link.
+    """
+    if sys.platform == "win32":
+        raise StoreError(
+            f"{path}: cannot be locked, as Windows has no flock; expected Linux or macOS "
+            "(on Windows, the Linux subsystem WSL)"
+        )
+    for _ in range(_TRIES):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            descriptor = os.open(path, os.O_RDWR | OWN_FILE, 0o666)
+        except FileNotFoundError:
+            continue  # The holder before us has just removed its folder.
+        with ExitStack() as unless_held:
+            unless_held.callback(os.close, descriptor)
+            if not locks_alone(descriptor):
+                who = _holder(descriptor) or "which has only just begun"
+                raise StoreError(
+                    f"{taken} ({who}); wait until it has ended, or choose another path"
+                )
+            if not is_at(descriptor, path):
+                continue  # What we locked has been removed; lock what is there now.
+            _sign(descriptor, path)
+            unless_held.pop_all()
+            return descriptor
+    raise StoreError(
+        f"{path}: cannot be locked, as it or its folder was removed {_TRIES} times meanwhile; "
+        "expected a folder that stays (is the current one deleted?). Choose another path"
+    )
+
+
+def _sign(descriptor: int, path: Path) -> None:
+    """Write into a lock which process holds it."""
+    state = os.fstat(descriptor)
+    if not stat.S_ISREG(state.st_mode) or (state.st_size and not _holder(descriptor)):
+        raise StoreError(
+            f"{path}: holds something else than a lock; move it away, or choose another path"
+        )
+    os.ftruncate(descriptor, 0)
+    told = {
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    os.pwrite(descriptor, orjson.dumps(told), 0)
+
+
+def _holder(descriptor: int) -> str:
+    """Return the process that a lock names as its holder, or ""."""
+    try:
+        told = orjson.loads(os.pread(descriptor, 4096, 0))
+        return f"process {told['pid']} on {told['host']}, since {told['since']}"
+    except (ValueError, TypeError, LookupError, OSError):
+        return ""

@@ -22,7 +22,7 @@ from slatprep.learn.metrics import fit_baselines
 from slatprep.learn.runs import BEST, LAST, Run
 from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
 from slatprep.readers.splits import Shares, split_of
-from slatprep.storage.lock import take_lock
+from slatprep.storage.atomic import take_lock
 
 SHARES = Shares(0.4, 0.3, 0.3)
 SHORT = TrainParameters(

@@ -13,8 +13,7 @@ from slatprep.errors import StoreError
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.join import subset_store
 from slatprep.pipeline.work import work_beside
-from slatprep.storage.atomic import staged, writing
-from slatprep.storage.lock import take_lock
+from slatprep.storage.atomic import staged, take_lock, writing
 
 MINE = "what somebody else wrote"
 
