@@ -273,7 +273,7 @@ def subset(
     """
     if not (assets or chosen.verdicts or chosen.categories):
         raise click.UsageError("say which assets: --asset ID, --verdict or --category")
-    from slatprep.inspect.listing import list_assets
+    from slatprep.inspect.overview import list_assets
     from slatprep.pipeline.join import subset_store
 
     wanted = list(assets)

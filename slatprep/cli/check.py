@@ -290,7 +290,7 @@ def measure_errors(
     with output.progress("decoys") as progress:
         found = measure(opened, decoys, seed, jobs, progress)
     if picture is not None:
-        from slatprep.inspect.pictures.errors import draw_errors
+        from slatprep.inspect.pictures.statistics import draw_errors
 
         options.draw_to(output, picture, partial(draw_errors, found, opened.name))
     output.result(_document(found), lambda: _show_errors(output, found))

@@ -150,7 +150,7 @@ def list_assets(
     slatprep list data/demo.zarr --verdict doubtful --verdict failed
     slatprep list data/demo.zarr --category tree --ids
     """
-    from slatprep.inspect.listing import list_assets as listed_of
+    from slatprep.inspect.overview import list_assets as listed_of
     from slatprep.pipeline.decoys import measured_errors
 
     opened = options.opened(store)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,18 +14,16 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import displacement, voxel_centres
 from slatprep.inspect.difference import AssetChange, PropertyChange, Setting, StoreDifference
 from slatprep.normalize import denormalize_properties
+from slatprep.pipeline.previous import SourceStore
 from slatprep.records import RESOLUTION, Place
 from slatprep.store import Store, open_store
 from slatprep.store.assets import ASSET_COLUMNS
 from slatprep.store.reader import VOXEL_COLUMNS
-from slatprep.store.records import StoredRecords
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
 
 _ROUNDING = 1e-6
 """Share of a range; rounding to float32 in two normalisations differs by less."""
-
-_TASK_ASSETS = 32
 
 _Rows = tuple[int, int]
 """The rows of an asset in the two stores."""
@@ -168,19 +165,18 @@ def _changes(
     columns = np.stack([_unequal(a.column(name)[both[0]], b.column(name)[both[1]])
                         for name in names])  # fmt: skip
     verdicts = [store.column("verdict")[own] for store, own in zip((a, b), both, strict=True)]
-    starts = range(0, len(rows), _TASK_ASSETS)
-    tasks = ((a.path, b.path, rows[start : start + _TASK_ASSETS]) for start in starts)
-    done = 0
-    for some in run_in_order(_compare_some, tasks, jobs):
-        for change in some:
-            own = tuple(
-                f"asset/{name}"
-                for name, other in zip(names, columns[:, done], strict=True)
-                if other
-            )
-            words = str(verdicts[0][done]), str(verdicts[1][done])
-            done += 1
-            yield _described(replace(change, verdicts=words, columns=own + change.columns))
+    sources = SourceStore(a.path), SourceStore(b.path)
+    tasks = (
+        (
+            *sources,
+            pair,
+            tuple(str(own[k]) for own in verdicts),
+            [f"asset/{name}" for name, other in zip(names, columns[:, k], strict=True) if other],
+        )
+        for k, pair in enumerate(rows)
+    )
+    for done, change in enumerate(run_in_order(_compare, tasks, jobs), 1):
+        yield change
         if progress:
             progress(done, len(rows))
 
@@ -199,31 +195,19 @@ _WORDS = {"voxel/material": "labels", "voxel/valid": "labels", "voxel/feats": "l
 """The word for a difference in an array; ``columns`` for all others and for ``asset/*``."""
 
 
-def _described(change: AssetChange) -> AssetChange:
-    """Return a change with `what` filled in, and only arrays without a word in `columns`."""
-    words = {_WORDS.get(name, "columns") for name in change.columns}
-    words |= {"sources"} if change.sources else set()
-    words |= {"verdict"} if change.verdicts[0] != change.verdicts[1] else set()
-    words |= {"placement"} if change.moved else set()
-    columns = tuple(name for name in change.columns if name not in _WORDS)
-    return replace(change, what=tuple(sorted(words)), columns=columns)
-
-
-def _compare_some(path_a: Place, path_b: Place, rows: Sequence[_Rows]) -> list[AssetChange]:
-    """Compare some assets, in a worker; the columns of ``asset/*`` are left to the caller."""
-    stores = open_store(path_a), open_store(path_b)
-    records = [StoredRecords(store) for store in stores]
-    changes = []
-    for pair in rows:
-        here, there = (own.read(row) for own, row in zip(records, pair, strict=True))
-        digests = [{(one.role, one.sha256) for one in own.sources} for own in (here, there)]
-        roles = tuple(sorted({role for role, _ in digests[0] ^ digests[1]}))
-        changes.append(_compare(*stores, here.asset_id, pair, roles))
-    return changes
-
-
-def _compare(a: Store, b: Store, asset_id: str, rows: _Rows, roles: tuple[str, ...]) -> AssetChange:
-    """Compare the voxels of an asset, whose sources differ in some roles."""
+def _compare(
+    source_a: SourceStore,
+    source_b: SourceStore,
+    rows: _Rows,
+    verdicts: tuple[str, str],
+    columns: Sequence[str],
+) -> AssetChange:
+    """Compare an asset, in a worker; its verdicts and the `columns` that differ are known."""
+    records = [source.records.read(row) for source, row in zip((source_a, source_b), rows,
+                                                               strict=True)]  # fmt: skip
+    digests = [{(one.role, one.sha256) for one in record.sources} for record in records]
+    roles = {role for role, _ in digests[0] ^ digests[1]}
+    a, b = source_a.store, source_b.store
     one, other = a.read(rows[0], VOXEL_COLUMNS), b.read(rows[1], VOXEL_COLUMNS)
     coords = one.pop("coords"), other.pop("coords")
     unmatched, moved = 0, 0.0
@@ -247,8 +231,9 @@ def _compare(a: Store, b: Store, asset_id: str, rows: _Rows, roles: tuple[str, .
         try:
             moved = displacement(transforms[0], transforms[1], voxel_centres(coords[0], sides[0]))
         except ValueError as error:
-            raise StoreError(f"{a.path} or {b.path}: asset {asset_id}: {error}; run `slatprep "
-                             "verify`") from None  # fmt: skip
+            both = f"{a.path} or {b.path}"
+            what = f"{both}: asset {a.ids[rows[0]]}: {error}; run `slatprep verify`"
+            raise StoreError(what) from None
     elif not np.array_equal(one["place"], other["place"]):
         apart = other["place"].astype(np.float64) - one["place"]
         moved = float(np.linalg.norm(apart, axis=1).mean() * RESOLUTION)
@@ -257,12 +242,17 @@ def _compare(a: Store, b: Store, asset_id: str, rows: _Rows, roles: tuple[str, .
     differ = [name for name in one if _unequal(one[name], other[name]).any()]
     differ += ["properties"] * any(own.changed for own in properties.values())
     differ += ["coords"] * (not order)
+    arrays = [*columns, *(f"voxel/{name}" for name in differ)]
+    words = {_WORDS.get(name, "columns") for name in arrays}
+    words |= {"sources"} if roles else set()
+    words |= {"verdict"} if verdicts[0] != verdicts[1] else set()
+    words |= {"placement"} if moved else set()
     return AssetChange(
-        asset_id=asset_id,
-        what=(),
-        verdicts=("", ""),
-        sources=roles,
-        columns=tuple(f"voxel/{name}" for name in differ),
+        asset_id=a.ids[rows[0]],
+        what=tuple(sorted(words)),
+        verdicts=verdicts,
+        sources=tuple(sorted(roles)),
+        columns=tuple(name for name in arrays if name not in _WORDS),
         moved=moved,
         voxels=len(labels),
         unmatched=unmatched,

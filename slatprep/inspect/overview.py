@@ -1,9 +1,9 @@
-"""The contents and quality of a store, for one screen."""
+"""The contents and quality of a store, for one screen, and its assets in a list."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.judge import THRESHOLDS
-from slatprep.records import Normalization, Place, Verdict
+from slatprep.records import Normalization, Place, Verdict, words_of
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
+from slatprep.store.records import StoredRecords
 
 UNKNOWN = "(unknown)"
 """Name of the group of assets whose category is not known."""
@@ -111,3 +112,57 @@ def _group(name: str, columns: dict[str, NDArray[Any]], chosen: list[int]) -> Gr
 
 def _counts(values: Sequence[Any] | NDArray[Any]) -> dict[str, int]:
     return dict(sorted(Counter(map(str, values)).items()))
+
+
+@dataclass(frozen=True)
+class ListedAsset:
+    """One line of the list; ``reasons`` say why the verdict is not ``good``."""
+
+    asset_id: str
+    category: str
+    verdict: str
+    confidence: float
+    fitness: float
+    voxels: int
+    reasons: tuple[str, ...]
+
+
+def rows_chosen(
+    store: Store, verdicts: Collection[str] = (), categories: Collection[str] = ()
+) -> list[int]:
+    """Return the rows of assets with these verdicts and categories; empty takes all."""
+    verdicts, categories = words_of(verdicts), words_of(categories)
+    named = zip(store.column("verdict"), store.column("category"), strict=True)
+    return [
+        row
+        for row, (verdict, category) in enumerate(named)
+        if (not verdicts or verdict in verdicts) and (not categories or category in categories)
+    ]
+
+
+def list_assets(
+    store: Store,
+    verdicts: Collection[str] = (),
+    categories: Collection[str] = (),
+    max_confidence: float | None = None,
+) -> Iterator[ListedAsset]:
+    """Yield the assets of a store, sorted by id.
+
+    They have one of `verdicts` and `categories`, where given, and at most `max_confidence`.
+    StoreError if the store, or the record of an asset that is not good, cannot be read.
+    """
+    table, records, ids = store.table(), StoredRecords(store), store.ids
+    for row in sorted(rows_chosen(store, verdicts, categories), key=ids.__getitem__):
+        verdict, confidence = str(table["verdict"][row]), float(table["confidence"][row])
+        if max_confidence is not None and not confidence <= max_confidence:
+            continue
+        good = verdict == Verdict.GOOD  # A record takes a millisecond to read, and most are good.
+        yield ListedAsset(
+            ids[row],
+            str(table["category"][row]),
+            verdict,
+            confidence,
+            float(table["fitness"][row]),
+            int(table["voxels"][row]),
+            () if good else records.read(row).judgement.reasons,
+        )

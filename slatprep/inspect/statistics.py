@@ -23,8 +23,7 @@ from slatprep.inspect.distributions import (
     StoreStatistics,
     Weight,
 )
-from slatprep.inspect.listing import rows_chosen
-from slatprep.inspect.overview import UNKNOWN
+from slatprep.inspect.overview import UNKNOWN, rows_chosen
 from slatprep.inspect.tallies import JOINT_BINS, SideTally, Tally, no_tally, pooled, tally
 from slatprep.records import Contents, Normalization, Place, Verdict
 from slatprep.store import Store, open_store
@@ -86,27 +85,27 @@ def store_statistics(
     verdict_of = [str(verdict) for verdict in store.column("verdict")]
     # Ordered by category, so that only one category's tally is in memory at a time.
     rows.sort(key=lambda row: (column[row], row))
-    of_category = [list(own) for _, own in groupby(rows, column.__getitem__)]
     portions = [
-        [own[start : start + _TASK_ASSETS] for start in range(0, len(own), _TASK_ASSETS)]
-        for own in of_category
+        own[start : start + _TASK_ASSETS]
+        for own in (list(some) for _, some in groupby(rows, column.__getitem__))
+        for start in range(0, len(own), _TASK_ASSETS)
     ]
-    tasks = ((store.path, some, weight == "asset") for own in portions for some in own)
-    tallies = run_in_order(_tally_some, tasks, jobs)
+    tasks = ((store.path, some, weight == "asset") for some in portions)
+    tallied = zip(portions, run_in_order(_tally_some, tasks, jobs), strict=True)
     ranges, contents = store.normalization.ranges, store.contents
     make = _Summariser(store.normalization, contents)
     total = nothing = no_tally(store.normalization, BINS, contents=contents)
     done, groups = 0, []
-    for own, parts in zip(of_category, portions, strict=True):
-        here = nothing
-        for some in parts:
-            here += next(tallies)
+    for category, parts in groupby(tallied, lambda part: column[part[0][0]]):
+        here, verdicts_here = nothing, Counter[str]()
+        for some, counts in parts:
+            here += counts
+            verdicts_here.update(verdict_of[row] for row in some)
             done += len(some)
             if progress:
                 progress(done, len(rows))
         total += here
-        name = column[own[0]] or UNKNOWN
-        groups.append(make.group("category", name, here, Counter(verdict_of[r] for r in own)))
+        groups.append(make.group("category", category or UNKNOWN, here, verdicts_here))
     everything = make.group("all", "all", total, Counter(verdict_of[row] for row in rows))
     classes = [
         make.group("class", name, total, None, index) for index, name in enumerate(contents.labels)

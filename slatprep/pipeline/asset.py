@@ -82,7 +82,7 @@ def process_asset(
 
 
 def finish_asset(
-    pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
+    pair: AssetPair, planned: PlannedAsset, context: BuildContext
 ) -> Row | FailedRecord:
     """Bring one asset into the spool, with no more work than it needs; return its row.
 
@@ -90,7 +90,7 @@ def finish_asset(
     `strict`, the asset's own fault.
     """
     reached("asset begun", pair.asset_id)
-    if planned is not None and planned.action is Action.RESUME:
+    if planned.action is Action.RESUME:
         resumed = _resumed(planned, context.spool)
         if resumed is not None:
             return resumed
@@ -110,9 +110,7 @@ def finish_asset(
     return replace(kept, damaged=damaged, seen=as_read(pair, noted))
 
 
-def fail_asset(
-    pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
-) -> FailedRecord:
+def fail_asset(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> FailedRecord:
     """Record as failed an asset that killed its worker twice, the second time alone in it."""
     reason = "its worker process was killed twice, probably because memory ran out"
     if context.strict:
@@ -121,19 +119,18 @@ def fail_asset(
 
 
 def _processed(
-    pair: AssetPair, planned: PlannedAsset | None, context: BuildContext
+    pair: AssetPair, planned: PlannedAsset, context: BuildContext
 ) -> tuple[Finished, str, str]:
     """Return an asset, its key, and in words why what the store has of it does not hold."""
     damaged = ""
-    if context.previous is not None and planned is not None and planned.action is Action.REUSE:
+    if context.previous is not None and planned.action is Action.REUSE:
         asset = _repeated(pair, planned.key, context, context.previous)
         if asset is not None:
             return asset, planned.key, ""
         damaged = "what the store holds of it is not what its record and its sources give"
     asset = process_asset(pair, context.parameters)
     key = _key(asset, context.recipe)
-    changed = planned is not None and planned.key != key  # since the plan
-    return asset, key, "" if changed else damaged
+    return asset, key, damaged if planned.key == key else ""  # It changed since the plan.
 
 
 def _repeated(

@@ -161,7 +161,7 @@ def look_back(
         # One that cannot be opened is told of when it is checked.
         damaged = () if fresh else checked_store(place.store, 1)[1]
         return replace(before, damaged=damaged)
-    seen = read_seen(_seen_folder(place), bound_to(previous.build_id, before.asked))
+    seen = read_seen(_seen_folder(place), bound_to(previous.store.about.manifest, before.asked))
     states = {} if rehash or not seen.keys else look(pairs)
     keys = ((asset_id, seen.keys.get(state)) for asset_id, state in states.items())
     return replace(

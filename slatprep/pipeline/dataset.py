@@ -177,7 +177,7 @@ def finish(
 ) -> list[Row | FailedRecord]:
     """Bring assets into the spool; return what is kept of each, in no order.
 
-    `plan` says what is to be done by id; of those that it does not have, everything.
+    `plan` says what is to be done by id.
     """
     if not pairs:
         return []
@@ -185,12 +185,12 @@ def finish(
     from slatprep.pipeline.asset import compile_kernels, fail_asset, finish_asset
 
     jobs = crew.of(len(pairs))
-    read = [p for p in pairs if p.asset_id not in plan or plan[p.asset_id].action is Action.ALIGN]
+    read = [pair for pair in pairs if plan[pair.asset_id].action is Action.ALIGN]
     if isinstance(jobs, int) and read:
         start_early(finish_asset, jobs)
         fetch_members(read, crew.note)
         compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
-    tasks = ((pair, plan.get(pair.asset_id), context) for pair in pairs)
+    tasks = ((pair, plan[pair.asset_id], context) for pair in pairs)
     assets: list[Row | FailedRecord] = []
     if crew.progress:
         crew.progress(0, len(pairs))
@@ -300,9 +300,9 @@ def _plan(
     crew: Crew,
     known: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, PlannedAsset]:
-    """Return what is to be done by asset id; nothing where nothing was done before."""
+    """Return what is to be done by asset id: everything, where nothing was done before."""
     if context.previous is None and not context.spool.holds_any():
-        return {}
+        return {p.asset_id: PlannedAsset(p.asset_id, Action.ALIGN, "new") for p in pairs}
     return {asset.asset_id: asset for asset in plan_assets(pairs, context, crew, known)}
 
 
@@ -312,8 +312,7 @@ def _split(
     """Return the pairs that are new or changed, and those whose alignment is in the store."""
     split: tuple[list[AssetPair], list[AssetPair]] = ([], [])
     for pair in pairs:
-        planned = plan.get(pair.asset_id)
-        split[planned is not None and planned.action is Action.REUSE].append(pair)
+        split[plan[pair.asset_id].action is Action.REUSE].append(pair)
     return split
 
 

@@ -83,13 +83,13 @@ def subset_store(
         If the store lacks an asset, or cannot be read, or the disk does not take the new one.
     """
     source = _source(store)
-    held = source.store
-    chosen = sorted({held.match(name) for name in assets}, key=held.ids.__getitem__)
-    if not chosen:
+    held, everything = source.store, _rows([source])
+    rows = [everything[row] for row in {held.match(name) for name in assets}]
+    if not rows:
         raise ConfigError(f"no asset of {held.path} is chosen; expected one at least")
-    rows = [(0, row) for row in chosen]
-    ranges, contents = source.normalization, held.contents
-    return _write([source], rows, ranges, contents, source.build, out, manifests, jobs, progress)
+    place, parameters = Destination(out, manifests), _parameters([source], source.build)
+    how = source.normalization, held.contents, source.build, parameters.store
+    return _write(NextStore(_by_id(rows), (source,), *how), parameters, place, jobs, progress)
 
 
 def concat_stores(
@@ -130,49 +130,55 @@ def concat_stores(
     sources = [_source(store) for store in stores]
     if len(sources) < 2:
         raise ConfigError(f"{len(sources)} stores to join; expected two or more")
-    everything = [(n, row) for n, source in enumerate(sources) for row in range(len(source.store))]
-    times = Counter(sources[n].store.ids[row] for n, row in everything)
+    rows = _rows(sources)
+    times = Counter(row.asset_id for row in rows)
     twice = sorted(asset_id for asset_id, count in times.items() if count > 1)
     if twice:
         raise ConfigError(
             f"{len(twice)} ids are in more than one store, such as {', '.join(twice[:3])}; "
             "expected each once: leave them out of one with `slatprep subset`"
         )
-    build, contents = _common_build(sources), _common_contents(sources)
-    ranges = _common_ranges(sources)
-    rows = sorted(everything, key=lambda row: sources[row[0]].store.ids[row[1]])
-    return _write(sources, rows, ranges, contents, build, out, manifests, jobs, progress)
+    build, contents = _common_build(sources), _common_contents(sources, rows)
+    place, parameters = Destination(out, manifests), _parameters(sources, build)
+    how = _common_ranges(sources), contents, build, parameters.store
+    return _write(NextStore(_by_id(rows), tuple(sources), *how), parameters, place, jobs, progress)
 
 
 def _source(place: str | Place) -> SourceStore:
     return SourceStore(open_store(place).path.absolute())
 
 
+def _rows(sources: Sequence[SourceStore]) -> list[Row]:
+    """Return all rows of stores."""
+    return [
+        Row(asset_id, size, store=number, row=row)
+        for number, source in enumerate(sources)
+        for row, (asset_id, size) in enumerate(
+            zip(source.store.ids, np.diff(source.store.offsets).tolist(), strict=True)
+        )
+    ]
+
+
+def _by_id(rows: Iterable[Row]) -> list[Row]:
+    return sorted(rows, key=lambda row: row.asset_id)
+
+
 def _write(
-    sources: Sequence[SourceStore],
-    chosen: Sequence[tuple[int, int]],
-    normalization: Normalization,
-    contents: Contents,
-    build: dict[str, Any],
-    out: str | Place,
-    manifests: str | Place | None,
+    new: NextStore,
+    parameters: BuildParameters,
+    place: Destination,
     jobs: Jobs,
     progress: Progress | None,
 ) -> BuildSummary:
-    """Write a store of rows of others, each named by the number of its store and its row there."""
+    """Write a store of rows of others."""
     begin = time.perf_counter()
-    place = Destination(out, manifests)
-    for source in sources:
+    for source in new.stores:
         if _same_place(source.path, place.store):
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
-    parameters = _parameters(sources, build)
-    sizes = [np.diff(source.store.offsets).tolist() for source in sources]
-    rows = [Row(sources[n].store.ids[row], sizes[n][row], store=n, row=row) for n, row in chosen]
-    _require_unclipped(sources, rows, normalization)
-    new = NextStore(rows, tuple(sources), normalization, contents, build, parameters.store)
+    _require_unclipped(new)
     with work_beside(place.store, look=place.look) as work:
         with writing(str(place.out), work_directory(place.store).parent):
-            jobs = at_most(len(rows) // _ROWS_A_JOB, jobs)
+            jobs = at_most(len(new.rows) // _ROWS_A_JOB, jobs)
             packed = pack_store(work.scratch, new, work.spool, jobs, progress=progress)
             place.replace(packed.store, packed.staged)
         store = open_store(place.in_place())
@@ -183,20 +189,16 @@ def _write(
     return summary
 
 
-def _require_unclipped(
-    sources: Sequence[SourceStore], rows: Sequence[Row], normalization: Normalization
-) -> None:
+def _require_unclipped(new: NextStore) -> None:
     """Raise StoreError where a row is to be brought to ranges, and lost values to its own."""
-    for number, source in enumerate(sources):
-        if source.normalization == normalization:
-            continue
-        clipped = source.store.column("clipped") + source.store.column("clipped_grid")
-        for row in rows:
-            if row.store == number and clipped[row.row].any():
-                raise StoreError(
-                    f"{source.path}: values of {row.asset_id} were clipped to its ranges, "
-                    "so it cannot be brought to others; build it again"
-                )
+    clipped = (new.column("clipped") + new.column("clipped_grid")).any(axis=1)
+    for row, lost in zip(new.rows, clipped, strict=True):
+        source = new.stores[row.store]
+        if lost and source.normalization != new.normalization:
+            raise StoreError(
+                f"{source.path}: values of {row.asset_id} were clipped to its ranges, "
+                "so it cannot be brought to others; build it again"
+            )
 
 
 def _same_place(one: Place, other: Place) -> bool:
@@ -214,7 +216,7 @@ def _places_of_sources(store: SourceStore) -> dict[str, Any]:
         record = build_in(folder)
     except StoreError:
         return {}  # The store does not need it, and `slatprep verify` names it.
-    if record.id != store.build_id:
+    if record.id != store.store.about.manifest:
         return {}
     names = ("pixieverse", "also", "slat", "pairing")
     named = {name: getattr(record.parameters, name) for name in names}
@@ -291,7 +293,7 @@ def _in_words(space: LatentSpace) -> str:
     return f"{space.encoder!r} ({grid}, standardised: {space.standardised})"
 
 
-def _common_contents(sources: Sequence[SourceStore]) -> Contents:
+def _common_contents(sources: Sequence[SourceStore], rows: Sequence[Row]) -> Contents:
     """Return what all stores hold; moments of latents that a build measured are pooled."""
     first = sources[0].store.contents
     for source in sources[1:]:
@@ -310,11 +312,4 @@ def _common_contents(sources: Sequence[SourceStore]) -> Contents:
     if all(source.store.contents == first for source in sources):
         return first
     unknown = replace(first, latents=replace(first.latents, mean=(), std=()))
-    rows = [
-        Row(asset_id, size, store=number, row=row)
-        for number, source in enumerate(sources)
-        for row, (asset_id, size) in enumerate(
-            zip(source.store.ids, np.diff(source.store.offsets).tolist(), strict=True)
-        )
-    ]
     return resolved_contents(rows, sources, unknown, "as said")

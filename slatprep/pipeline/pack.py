@@ -28,7 +28,7 @@ from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import put_objects
 from slatprep.storage.upload import Staged
-from slatprep.store.layout import ARRAYS, RECORD_ARRAY, ArrayLayout, arrays_with, overlaps
+from slatprep.store.layout import ARRAYS, RECORD_ARRAY, arrays_with, overlaps
 from slatprep.store.runs import Run, Runs, runs_of
 from slatprep.store.shard_writer import ShardWriter, Written
 from slatprep.store.writer import (
@@ -93,7 +93,7 @@ def pack_store(
     runs = {group: _runs(path, group, new) for group in GROUPS}
     taken, records = _taken(path, new, runs)
     todo = list(shards([row.where for row in new.rows], new.offsets, new.parameters, runs, taken))
-    clipped = {group: _clipped_before(name, new) for group, name in _CLIPPED.items()}
+    clipped = {group: new.column(name) for group, name in _CLIPPED.items()}
     here, written = remote or path, dict[str, Written]()
     # Those of grids, which take longest, first: so the last shards keep all workers at work.
     todo.sort(key=lambda shard: shard.group != "grid")
@@ -342,16 +342,6 @@ def _take(path: Path, new: NextStore, taken: frozenset[tuple[str, int]]) -> dict
     return files
 
 
-def _clipped_before(name: str, new: NextStore) -> NDArray[np.int64]:
-    """Return what older stores clipped, (A, P) by row and property."""
-    counts = np.zeros((len(new.rows), len(new.contents.properties)), np.int64)
-    held = [source.store.column(name) for source in new.stores]
-    for k, row in enumerate(new.rows):
-        if not row.spooled:
-            counts[k] = held[row.store][row.row]
-    return counts
-
-
 def _write_columns(path: Path, new: NextStore, found: Mapping[str, NDArray[np.int64]]) -> None:
     """Write every ``asset/*`` array; `found` are those that packing fills, by last name."""
     group = open_for_writing(path)["asset"]
@@ -359,8 +349,4 @@ def _write_columns(path: Path, new: NextStore, found: Mapping[str, NDArray[np.in
         where, _, name = layout.name.partition("/")
         if where == "asset":
             values = found[name] if name in found else new.column(name)
-            group[name][:] = np.array(values, _dtype(layout))
-
-
-def _dtype(layout: ArrayLayout) -> Any:
-    return object if layout.dtype == "str" else layout.dtype
+            group[name][:] = np.array(values, object if layout.dtype == "str" else layout.dtype)

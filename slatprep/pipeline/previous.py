@@ -49,11 +49,6 @@ class SourceStore:
         """The store, open."""
         return open_store(self.path)
 
-    @property
-    def build_id(self) -> str:
-        """Id of its build."""
-        return str(self.store.attributes.get("manifest"))
-
     @cached_property
     def normalization(self) -> Normalization:
         """The ranges of its properties."""

@@ -25,7 +25,7 @@ from slatprep.geometry.voxels import boundary
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
 from slatprep.readers.identity import source_digests
-from slatprep.records import Failed, Finished, SourceFile, Status
+from slatprep.records import AssetPair, Failed, Finished, SourceFile, Status
 from slatprep.store.record import (
     MAX_WARNINGS,
     AssetRecord,
@@ -121,18 +121,12 @@ def _environment() -> dict[str, str]:
 
 def record_of(asset: Finished, recipe: Recipe, key: str) -> AssetRecord:
     """Return the record of an asset that went through all stages, as the store will hold it."""
-    pair, field, latents = asset.pair, asset.field, asset.latents
+    field, latents = asset.field, asset.latents
     return AssetRecord(
-        asset_id=pair.asset_id,
-        object_id=pair.object_id,
-        view=pair.view,
-        category=pair.category,
+        **_said_of(asset.pair, recipe),
         status=Status.OK,
         sources=asset.sources or field.sources + latents.sources,
         bounds=field.bounds,
-        parameters=recipe.parameters,
-        versions={**_environment(), **recipe.versions},
-        code=recipe.code,
         key=key,
         alignment=asset.alignment,
         judgement=asset.judgement,
@@ -153,19 +147,23 @@ def _first(warnings: tuple[str, ...]) -> tuple[str, ...]:
 
 def record_of_failed(asset: Failed, recipe: Recipe) -> FailedRecord:
     """Return the record of an asset that cannot go in."""
-    pair = asset.pair
     return FailedRecord(
-        asset_id=pair.asset_id,
-        object_id=pair.object_id,
-        view=pair.view,
-        category=pair.category,
+        **_said_of(asset.pair, recipe),
         status=asset.status,
         reason=asset.reason,
         traceback=asset.traceback,
-        parameters=recipe.parameters,
-        versions={**_environment(), **recipe.versions},
-        code=recipe.code,
     )
+
+
+def _said_of(pair: AssetPair, recipe: Recipe) -> dict[str, Any]:
+    """Return what the record of any asset says, whether it goes in or not."""
+    names = ("asset_id", "object_id", "view", "category")
+    return {
+        **{name: getattr(pair, name) for name in names},
+        "parameters": recipe.parameters,
+        "versions": {**_environment(), **recipe.versions},
+        "code": recipe.code,
+    }
 
 
 def _counts_of(asset: Finished) -> VoxelCounts:

@@ -173,10 +173,10 @@ class NextStore:
     def same_as(self, other: SourceStore) -> bool:
         """Whether another store is this one: the same build, in the same order of rows."""
         ids = [row.asset_id for row in self.rows]
-        return self.build_id == other.build_id and ids == other.store.ids
+        return self.build_id == other.store.about.manifest and ids == other.store.ids
 
     def column(self, name: str) -> NDArray[Any]:
-        """Return an ``asset/*`` array by its last name, but for what packing finds."""
+        """Return an ``asset/*`` array by its last name; of what packing clips, what is known."""
         if name in ("id", "offset"):
             ids = [row.asset_id for row in self.rows]
             return np.array(ids, object) if name == "id" else np.array(self.offsets, np.int64)

@@ -211,6 +211,8 @@ def row_of(record: AssetRecord, text: bytes, extent: NDArray[np.float64]) -> Row
         **columns_of(record),
         "record_sha256": np.frombuffer(digest_of(text), np.uint8),
         "extent": extent,
+        "clipped": np.zeros(len(extent), np.int64),  # As long as nothing is packed.
+        "clipped_grid": np.zeros(len(extent), np.int64),
         "n_valid": record.counts.valid,
         "n_placements": len(record.alignment.placements),
         "unusual": next((one for one in record.warnings if TOLD in one), "").partition(TOLD)[2],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,27 +109,28 @@ class Counts:
 def counts_of(assets: Iterable[Row]) -> Counts:
     """Count what became of finished assets."""
     usable = list(assets)
-    return Counts(
-        verdicts=dict(sorted(Counter(str(asset.columns["verdict"]) for asset in usable).items())),
-        n_voxels=sum(asset.n_voxels for asset in usable),
-        n_valid=sum(asset.columns["n_valid"] for asset in usable),
-        n_unphysical=int(np.sum([asset.columns["unphysical"] for asset in usable])),
-        contradicted=tuple(
-            islice((a.asset_id for a in usable if a.columns["contradicted"]), PROBLEMS_LISTED)
-        ),
+    sizes = np.array([asset.n_voxels for asset in usable], np.int64)
+    return _counts(
+        [asset.asset_id for asset in usable],
+        sizes,
+        lambda name: np.array([asset.columns[name] for asset in usable]),
     )
 
 
 def counts_in(store: Store) -> Counts:
     """Count what became of the assets of a store."""
-    sizes = np.diff(store.offsets)
-    rows = np.flatnonzero(store.column("contradicted"))
-    contradicted = sorted(store.ids[row] for row in rows)
+    return _counts(store.ids, np.diff(store.offsets), store.column)
+
+
+def _counts(
+    ids: Sequence[str], sizes: NDArray[np.int64], column: Callable[[str], NDArray[Any]]
+) -> Counts:
+    contradicted = sorted(ids[row] for row in np.flatnonzero(column("contradicted")).tolist())
     return Counts(
-        verdicts=dict(sorted(Counter(map(str, store.column("verdict"))).items())),
+        verdicts=dict(sorted(Counter(map(str, column("verdict"))).items())),
         n_voxels=int(sizes.sum()),
-        n_valid=int(np.rint(store.column("valid_share") * sizes).sum()),
-        n_unphysical=int(store.column("unphysical").sum()),
+        n_valid=int(np.rint(column("valid_share") * sizes).sum()),
+        n_unphysical=int(column("unphysical").sum()),
         contradicted=tuple(contradicted[:PROBLEMS_LISTED]),
     )
 

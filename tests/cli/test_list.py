@@ -7,7 +7,7 @@ from support.commands import document, run
 
 from slatprep import StoreError, open_store
 from slatprep.cli import output as module
-from slatprep.inspect.listing import list_assets
+from slatprep.inspect.overview import list_assets
 from slatprep.store.records import StoredRecords
 
 

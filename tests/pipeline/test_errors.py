@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.commands import run
 
-from slatprep.inspect.pictures.errors import draw_errors
+from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.pipeline.decoys import FILE, draw_decoys, measure_errors, measured_errors, told_of
 from slatprep.store import Store, open_store

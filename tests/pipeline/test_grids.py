@@ -21,8 +21,7 @@ from slatprep.demo.latents import Encoder
 from slatprep.errors import ConfigError
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.scene import scene_of
-from slatprep.inspect.report.thumbnails import SIDE, thumbnail
-from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
+from slatprep.inspect.report.drawn import COARSE, FULL, SIDE, encode_asset, thumbnail
 from slatprep.inspect.score import score_against_truth
 from slatprep.inspect.verify import verify_store
 from slatprep.learn.augment import lattice_symmetries, move

@@ -14,7 +14,7 @@ from slatprep import build_store, export_store, open_store, store_statistics
 from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.statistics import draw_statistics
-from slatprep.inspect.report.thumbnails import SHADES, thumbnail
+from slatprep.inspect.report.drawn import SHADES, thumbnail
 from slatprep.inspect.verify import verify_store
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predictions import open_predictions

@@ -86,7 +86,7 @@ def failed(number: int, status: Status = Status.FAILED) -> FailedRecord:
 
 
 def finished(name: str, verdict: str) -> Row:
-    columns = {"verdict": verdict, "unphysical": 4, "contradicted": name == "y", "n_valid": 7}
+    columns = {"verdict": verdict, "unphysical": 4, "contradicted": name == "y", "valid_share": 0.7}
     return Row(name, 10, columns=columns)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.inspect.check import AlignmentCheck
-from slatprep.inspect.pictures import palette
-from slatprep.inspect.pictures.canvas import draw_legend, new_figure, size_of, write
+from slatprep.inspect.pictures import canvas
+from slatprep.inspect.pictures.canvas import draw_image, draw_legend, new_figure, size_of, write
 from slatprep.inspect.pictures.scene import (
     Deformed,
     Placed,
@@ -100,7 +100,7 @@ def outlined(scene: Scene, view: View, *sets: Placed) -> list[NDArray[np.float64
 
     The SLAT is pale where the set does not cover it.
     """
-    grey = np.broadcast_to(rgb(palette.RULE), (len(scene.slat), 3))
+    grey = np.broadcast_to(rgb(canvas.RULE), (len(scene.slat), 3))
     slat = draw_voxels(scene.slat, grey, np.eye(4), view, contrast=0.5)
     pale = 0.45 + 0.55 * slat.rgb
     line = _outline(slat)[..., None]
@@ -109,7 +109,7 @@ def outlined(scene: Scene, view: View, *sets: Placed) -> list[NDArray[np.float64
         field = draw_voxels(voxels, class_colours(material), transform, view)
         cover = field.cover[..., None]
         image = field.rgb * cover + pale * (1 - cover)
-        pictures.append(image * (1 - line) + rgb(palette.INK) * line)
+        pictures.append(image * (1 - line) + rgb(canvas.INK) * line)
     return pictures
 
 
@@ -153,20 +153,11 @@ def _panels(figure: Figure, scene: Scene, finer: int) -> None:
     for column, (name, meaning) in enumerate(columns_of(scene)):
         x = _LEFT + column * (PANEL + _GAP)
         write(figure, x, _TOP - 30, name, weight="bold", size=9)
-        write(figure, x, _TOP - 10, meaning, color=palette.MUTED, size=6.8)
+        write(figure, x, _TOP - 10, meaning, color=canvas.MUTED, size=6.8)
     for row, view in enumerate(views(scene, finer * PANEL)):
         y = _TOP + row * (PANEL + _GAP)
         for column, image in enumerate(panels(scene, view)):
-            x = _LEFT + column * (PANEL + _GAP)
-            pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-            if finer == 1:
-                figure.figimage(pixels, xo=x, yo=HEIGHT - y - PANEL, origin="upper")
-            else:
-                width = size_of(figure)[0]
-                box = x / width, 1 - (y + PANEL) / HEIGHT, PANEL / width, PANEL / HEIGHT
-                axes = figure.add_axes(box)
-                axes.imshow(pixels, interpolation="none")
-                axes.set_axis_off()
+            draw_image(figure, _LEFT + column * (PANEL + _GAP), y, image, finer)
         _axes_triad(figure, view, _LEFT + 6, y + PANEL - 34)
 
 
@@ -177,18 +168,18 @@ def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
     for k, name in enumerate("xyz"):
         dx, dy = 20 * view.rotation[:2, k]
         line = [(x + 12) / width, (x + 12 + dx) / width], [1 - y / height, 1 - (y - dy) / height]
-        figure.add_artist(Line2D(*line, color=palette.MUTED, linewidth=0.8))
+        figure.add_artist(Line2D(*line, color=canvas.MUTED, linewidth=0.8))
         write(
-            figure, x + 12 + 1.45 * dx, y - 1.45 * dy, name, size=6, color=palette.MUTED,
+            figure, x + 12 + 1.45 * dx, y - 1.45 * dy, name, size=6, color=canvas.MUTED,
             ha="center", va="center_baseline",
         )  # fmt: skip
 
 
 def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> int:
     """Write title, verdict and reasons; return the height of the last reason."""
-    colour, bold = palette.VERDICT_COLOURS[check.verdict], {"weight": "bold", "size": 13}
+    colour, bold = canvas.VERDICT_COLOURS[check.verdict], {"weight": "bold", "size": 13}
     write(figure, _LEFT, 50, title, **bold)
-    write(figure, _LEFT, 76, subtitle, size=7.5, color=palette.MUTED)
+    write(figure, _LEFT, 76, subtitle, size=7.5, color=canvas.MUTED)
     write(figure, side_of(figure), 50, f"alignment {check.verdict}", color=colour, **bold)
     reasons = list(check.words)
     if not check.consistent:
@@ -197,7 +188,7 @@ def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> i
     if len(lines) > _MOST_LINES:
         lines = [*lines[: _MOST_LINES - 1], "and more: `slatprep check-alignment` prints all"]
     for number, line in enumerate(lines):
-        write(figure, side_of(figure), 74 + 17 * number, line, size=7, color=palette.MUTED)
+        write(figure, side_of(figure), 74 + 17 * number, line, size=7, color=canvas.MUTED)
     return 74 + 17 * (len(lines) - 1)
 
 
@@ -212,8 +203,8 @@ def _legend(figure: Figure, scene: Scene) -> None:
     columns = 4 if scene.deformed is None else 3  # The fourth is above the scale.
     end = _LEFT + columns * (PANEL + _GAP) - _GAP
     words = "share of the SLAT voxels"
-    draw_legend(figure, entries, (_LEFT, y, end - 190), edgecolor=palette.MUTED, linewidth=0.5)
-    write(figure, end, y, words, size=6.8, color=palette.MUTED, ha="right")
+    draw_legend(figure, entries, (_LEFT, y, end - 190), edgecolor=canvas.MUTED, linewidth=0.5)
+    write(figure, end, y, words, size=6.8, color=canvas.MUTED, ha="right")
     if scene.deformed is not None:
         _scale(figure, displacement_scale(scene.deformed), _LEFT + 3 * (PANEL + _GAP), y)
 
@@ -222,8 +213,8 @@ def _scale(figure: Figure, farthest: float, x: int, y: int) -> None:
     """Draw the colour scale of displacements, 0 to `farthest` voxels, below their column."""
     along = np.linspace(0.0, farthest, PANEL)
     bar = np.broadcast_to(distance_colours(along, farthest)[None], (10, PANEL, 3))
-    figure.figimage(np.rint(bar * 255).astype(np.uint8), xo=x, yo=HEIGHT - y - 1, origin="upper")
+    draw_image(figure, x, y - 9, bar)
     ends = ((x, "0", "left"), (x + PANEL / 2, f"{farthest / 2:g}", "center"),
             (x + PANEL, f"{farthest:g} voxels", "right"))  # fmt: skip
     for at, words, ha in ends:
-        write(figure, at, y + 17, words, size=6.8, color=palette.MUTED, ha=ha)
+        write(figure, at, y + 17, words, size=6.8, color=canvas.MUTED, ha=ha)

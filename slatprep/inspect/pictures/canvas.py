@@ -1,15 +1,30 @@
-"""Figures with positions in pixels, and the style and formats of all pictures."""
+"""Figures with positions in pixels, and the colours, style and formats of all pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
-from slatprep.inspect.pictures import palette
+import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+VERDICT_COLOURS = {"good": "#1B7F4B", "doubtful": "#B26A00", "failed": "#B3261E"}
+"""Colour of each verdict, which is always written out too."""
+
+ACCENT = "#2E9FF5"
+INK = "#1F2328"
+MUTED = "#6B7280"
+RULE = "#D5D9DE"
+PAPER = "#FFFFFF"
+"""Highlight, text, secondary text, lines and background."""
+
+DISTANCE_COLOURS = ("#EEF1F4", "#F3BDB6", "#DD6472", "#931D52", "#2B0A3D")
+"""Distances from 0 to the end of the scale, in even steps of lightness."""
 
 DPI = 150
 
@@ -19,22 +34,29 @@ MOST_NAMES = 16
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.0,
-    "text.color": palette.INK,
-    "axes.edgecolor": palette.RULE,
-    "axes.labelcolor": palette.MUTED,
+    "text.color": INK,
+    "axes.edgecolor": RULE,
+    "axes.labelcolor": MUTED,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "xtick.color": palette.RULE,
-    "ytick.color": palette.RULE,
-    "xtick.labelcolor": palette.MUTED,
-    "ytick.labelcolor": palette.MUTED,
+    "xtick.color": RULE,
+    "ytick.color": RULE,
+    "xtick.labelcolor": MUTED,
+    "ytick.labelcolor": MUTED,
     "xtick.labelsize": 7.0,
     "ytick.labelsize": 7.0,
-    "figure.facecolor": palette.PAPER,
+    "figure.facecolor": PAPER,
     "svg.hashsalt": "slatprep",  # Otherwise ids within a file are random.
     "pdf.fonttype": 42,
 }
 """Settings of matplotlib."""
+
+
+def styled() -> AbstractContextManager[None]:
+    """Hold matplotlib to `STYLE`, whatever a user's matplotlibrc says."""
+    import matplotlib.style
+
+    return matplotlib.style.context(["default", STYLE])
 
 
 FORMATS: dict[str, dict[str, None]] = {
@@ -74,6 +96,19 @@ def write(figure: Figure, x: float, y: float, words: str, **style: Any) -> None:
     figure.text(x / width, 1 - y / height, words, parse_math=False, **style)
 
 
+def draw_image(figure: Figure, x: int, y: int, image: NDArray[np.float64], finer: int = 1) -> None:
+    """Put an image (rows, columns, 3) in 0..1 at a pixel, with `finer` of its pixels to one."""
+    pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    width, height = size_of(figure)
+    tall, wide = (side / finer for side in image.shape[:2])
+    if finer == 1:
+        figure.figimage(pixels, xo=x, yo=round(height - y - tall), origin="upper")
+        return
+    axes = figure.add_axes((x / width, 1 - (y + tall) / height, wide / width, tall / height))
+    axes.imshow(pixels, interpolation="none")
+    axes.set_axis_off()
+
+
 def draw_legend(
     figure: Figure,
     entries: Sequence[tuple[str, str]],
@@ -99,7 +134,7 @@ def draw_legend(
         more = f"and {len(entries) - number} more"
         after = 28 + 9.2 * len(more) if number + 1 < len(entries) and y == last else 0.0
         if number == MOST_NAMES or (x > left and x + wide + after > right):
-            write(figure, x, y, more, size=7.5, color=palette.MUTED)
+            write(figure, x, y, more, size=7.5, color=MUTED)
             return
         place = x / width, 1 - (y + 1) / height
         square = Rectangle(place, 13 / width, 13 / height, facecolor=colour, **style)

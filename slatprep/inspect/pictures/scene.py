@@ -16,7 +16,7 @@ from slatprep.geometry.frames import (
     voxel_centres,
 )
 from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
-from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
+from slatprep.inspect.pictures.canvas import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset

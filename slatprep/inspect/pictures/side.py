@@ -8,7 +8,7 @@ import numpy as np
 
 from slatprep.geometry.frames import split_transform
 from slatprep.inspect.check import AlignmentCheck
-from slatprep.inspect.pictures import palette
+from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.canvas import size_of, write
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours
 from slatprep.records import RESOLUTION, Alignment, Search
@@ -48,34 +48,34 @@ def draw_figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) 
     columns = (left, left + 275, left + SIDE_WIDTH)
     for x, name, ha in zip(columns, ("figure", "value", "good"), ("left", "right", "right"),
                            strict=True):  # fmt: skip
-        write(figure, x, y, name, size=6.8, color=palette.MUTED, ha=ha)
+        write(figure, x, y, name, size=6.8, color=canvas.MUTED, ha=ha)
     _rule(figure, y + 7)
     rows = [one for name in SHOWN for one in check.figures if one.name == name]
     for number, one in enumerate(rows):
         line = y + 30 + _LINE * number
         worse = one.passes is False
-        colour = palette.VERDICT_COLOURS["failed"] if worse else palette.INK
+        colour = canvas.VERDICT_COLOURS["failed"] if worse else canvas.INK
         write(figure, columns[0], line, SHOWN[one.name], size=7.5)
         # Adding 0 turns a rounded -0 into 0.
         value = "-" if np.isnan(one.value) else f"{round(one.value, 3) + 0.0:.3f}"
         write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
         limit = one.threshold_text.replace(">=", "\u2265").replace("<=", "\u2264")
-        write(figure, columns[2] - 26, line, limit, size=7.5, ha="right", color=palette.MUTED)
+        write(figure, columns[2] - 26, line, limit, size=7.5, ha="right", color=canvas.MUTED)
         if one.passes is not None:
             mark = "\u2717" if worse else "\u2713"
-            good = palette.VERDICT_COLOURS["failed" if worse else "good"]
+            good = canvas.VERDICT_COLOURS["failed" if worse else "good"]
             write(figure, columns[2], line, mark, size=7.5, ha="right", color=good)
     rotation, shift, scale = split_transform(check.transform)
     angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
     moved = np.linalg.norm(shift) * RESOLUTION
     words = f"turned {angle:.1f}°, shifted {moved:.2f} voxel, scaled {scale:.3f}"
     line = y + 36 + _LINE * len(rows)
-    write(figure, left, line, words, size=7, color=palette.MUTED)
+    write(figure, left, line, words, size=7, color=canvas.MUTED)
     if scene.deformed is not None:
         apart = scene.deformed.displacement
         words = f"deformed by {apart.mean():.2f} voxel in the mean, {apart.max():.2f} at most"
         line += 17
-        write(figure, left, line, words, size=7, color=palette.MUTED)
+        write(figure, left, line, words, size=7, color=canvas.MUTED)
     return line
 
 
@@ -87,7 +87,7 @@ def draw_histogram(figure: Figure, scene: Scene, radius: float, y: float) -> Non
     words = (
         f"median {np.median(scene.error):.2f} voxel, {share:.1%} within {radius:g}; line: {before}"
     )
-    write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
+    write(figure, side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
     axes = _axes(figure, y + 36, 190)
     edges = np.linspace(0, FARTHEST, 31)
     middles = (edges[:-1] + edges[1:]) / 2
@@ -96,10 +96,10 @@ def draw_histogram(figure: Figure, scene: Scene, radius: float, y: float) -> Non
         for error in (scene.error, scene.error_before)
     ]
     axes.bar(middles, shares[0], width=edges[1] * 0.92, color=distance_colours(middles).tolist(),
-             edgecolor=palette.MUTED, linewidth=0.3)  # fmt: skip
-    axes.stairs(shares[1], edges, color=palette.MUTED, linewidth=0.8)
+             edgecolor=canvas.MUTED, linewidth=0.3)  # fmt: skip
+    axes.stairs(shares[1], edges, color=canvas.MUTED, linewidth=0.8)
     axes.set_ylim(0, 1.15 * max(share.max() for share in shares))
-    axes.axvline(radius, color=palette.INK, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.axvline(radius, color=canvas.INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set_xlim(0, FARTHEST)
     axes.set_xticks(range(int(FARTHEST) + 1), ["0", "1 voxel", "2", f"\u2265 {FARTHEST:g}"])
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
@@ -112,14 +112,14 @@ def draw_candidates(figure: Figure, alignment: Alignment, y: float) -> None:
     write(figure, side_of(figure), y, "starts of the search", weight="bold", size=8.5)
     if not candidates:
         words = "none are recorded"
-        write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
+        write(figure, side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
         return
     own = sorted((c for c in candidates if c.same_as is None), key=lambda c: (-c.fitness, c.index))
     words = f"{len(own)} distinct of {len(candidates)}, by coarse fitness"
-    write(figure, side_of(figure), y + 20, words, size=7, color=palette.MUTED)
+    write(figure, side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
     axes = _axes(figure, y + 36, 190)
     wide = alignment.search is Search.SO3
-    colours = [palette.RULE if wide else palette.ACCENT] + [palette.RULE] * (len(own) - 1)
+    colours = [canvas.RULE if wide else canvas.ACCENT] + [canvas.RULE] * (len(own) - 1)
     axes.bar(range(len(own)), [c.fitness for c in own], width=0.78, color=colours)
     axes.set_xlim(-0.8, max(len(own), 2) - 0.2)
     axes.set_ylim(0, 1)
@@ -151,4 +151,4 @@ def _rule(figure: Figure, y: float) -> None:
 
     width, height = size_of(figure)
     ends = [side_of(figure) / width, (side_of(figure) + SIDE_WIDTH) / width]
-    figure.add_artist(Line2D(ends, [1 - y / height] * 2, color=palette.RULE, linewidth=0.8))
+    figure.add_artist(Line2D(ends, [1 - y / height] * 2, color=canvas.RULE, linewidth=0.8))

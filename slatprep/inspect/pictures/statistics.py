@@ -1,4 +1,4 @@
-"""The statistics of a store as a picture: histograms by class, joint histogram, classes."""
+"""A store as a picture: statistics of its voxels, or the errors of its alignments."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.inspect.distributions import Histogram, JointHistogram, StoreStatistics
-from slatprep.inspect.pictures import canvas, palette
+from slatprep.inspect.pictures import canvas
+from slatprep.pipeline.decoys import MeasuredErrors
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, Property
 from slatprep.store.reader import Store
 
@@ -26,19 +27,20 @@ _HISTOGRAM, _JOINT, _BAR, _BETWEEN = 190, 480, 26, 90
 """Heights of the kinds of plots, and of the gap between two rows, in pixels."""
 _COLOURS = tuple(MATERIAL_COLOURS.values())
 """Colours of the classes by index."""
+RATES = {0.01: "-", 0.05: "--"}
+"""Shares of wrong ones with a line, and how it is drawn."""
+
 _SIDES = (("field", "PixieVerse fields, before the lookup"), ("slat", "SLAT voxels, after it"))
 
 
 def draw_statistics(store: Store, statistics: StoreStatistics, kind: str = "png") -> bytes:
     """Draw the statistics of a store as a ``png``, ``svg`` or ``pdf``."""
-    import matplotlib.style
-
     kept = sorted(statistics.categories, key=lambda one: -one.slat.assets)[:MOST_CATEGORIES]
     shown = [group for group in statistics.categories if group in kept]
     joint = (_JOINT + _BETWEEN) * (statistics.joint is not None)
     rows = len(statistics.histograms) * (_HISTOGRAM + _BETWEEN)
     height = _HEAD + rows + joint + _BAR * max(len(shown), 1) + _BETWEEN + _FOOT
-    with matplotlib.style.context(["default", canvas.STYLE]):
+    with canvas.styled():
         figure = canvas.new_figure(_WIDTH, height)
         _head(figure, store, statistics)
         for column, (side, _) in enumerate(_SIDES):
@@ -67,7 +69,7 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
         f"every {what} one; not annotated: {_percent(statistics.total.field.unannotated)} before, "
         f"{_percent(statistics.total.slat.unannotated)} after"
     )
-    canvas.write(figure, 40, 74, words, size=7, color=palette.MUTED)
+    canvas.write(figure, 40, 74, words, size=7, color=canvas.MUTED)
     entries = [
         (group.name, colour)
         for group, colour in zip(statistics.classes, _COLOURS, strict=False)
@@ -106,7 +108,7 @@ def _joint(
 
     shares = np.ma.masked_equal(_shares(getattr(joint, side)), 0.0)
     first, second = (one for one in statistics.histograms if one.name in joint.names)
-    colours = LinearSegmentedColormap.from_list("shares", palette.DISTANCE_COLOURS[1:])
+    colours = LinearSegmentedColormap.from_list("shares", canvas.DISTANCE_COLOURS[1:])
     # The scale ends at 1e-5; smaller shares have its palest colour.
     mesh = axes.pcolormesh(
         *joint.edges, shares.T, cmap=colours, norm=LogNorm(1e-5, 1.0), rasterized=True
@@ -150,3 +152,41 @@ def _percent(share: float) -> str:
 
 def _cut(name: str) -> str:
     return name if len(name) <= 14 else f"{name[:13]}…"
+
+
+def draw_errors(errors: MeasuredErrors, name: str, kind: str = "png") -> bytes:
+    """Draw the scores of a store's alignments and of its decoys as a ``png``, ``svg`` or ``pdf``.
+
+    Lines are the least scores that keep the share of wrong ones at `RATES`.
+    """
+    from scipy.special import logit
+
+    edges, counts = np.array(errors.edges), errors.counts
+    with canvas.styled():
+        figure = canvas.new_figure(1200, 640)
+        canvas.write(figure, 40, 48, f"Same object? {name}", weight="bold", size=12)
+        for row, sentence in enumerate(errors.sentences()):
+            canvas.write(figure, 40, 76 + 22 * row, sentence, size=7, color=canvas.MUTED)
+        axes = figure.add_axes((0.07, 0.13, 0.9, 0.6))
+        axes.bar(edges[:-1], errors.targets, np.diff(edges), align="edge", color=canvas.ACCENT,
+                 alpha=0.7, label=f"{errors.assets:,} alignments of the dataset")  # fmt: skip
+        decoys = f"{len(errors.decoys):,} decoys: grids with SLATs of other objects"
+        axes.step(
+            edges,
+            [*counts, counts[-1]],
+            where="post",
+            color=canvas.VERDICT_COLOURS["failed"],
+            lw=1.6,
+            label=decoys,
+        )
+        for kept in errors.kept:
+            if kept.rate in RATES and kept.assets:
+                axes.axvline(kept.score, color=canvas.INK, lw=1, ls=RATES[kept.rate],
+                             label=f"{kept.assets:,} kept at {kept.rate:.0%} wrong")  # fmt: skip
+        ticks = np.array([1e-4, 0.01, 0.5, 0.99, 0.9999])
+        inside = (logit(ticks) >= edges[0]) & (logit(ticks) <= edges[-1])
+        axes.set_xticks(logit(ticks)[inside], [f"{tick:.4g}" for tick in ticks[inside]])
+        axes.set_xlabel("score, as a probability that the object is the same")
+        axes.set_ylabel("count")
+        axes.legend(frameon=False, loc="upper center")
+        return canvas.in_format(figure, kind)

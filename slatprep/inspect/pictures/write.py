@@ -1,4 +1,4 @@
-"""Write pictures of alignments as files."""
+"""Pictures of alignments as files: one for each, and a contact sheet of many."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError, amount
 from slatprep.inspect.check import AlignmentCheck, check_alignment
-from slatprep.inspect.pictures.alignment import draw_alignment
-from slatprep.inspect.pictures.canvas import FORMATS, STYLE, in_format
-from slatprep.inspect.pictures.scene import Scene, scene_of
-from slatprep.inspect.pictures.sheet import MOST, draw_sheet
+from slatprep.inspect.pictures import canvas
+from slatprep.inspect.pictures.alignment import draw_alignment, error_picture, outlined
+from slatprep.inspect.pictures.canvas import FORMATS, draw_image, in_format, new_figure, write
+from slatprep.inspect.pictures.scene import FARTHEST, Scene, scene_of, views
 from slatprep.records import Place
 from slatprep.storage.atomic import staged
 from slatprep.storage.files import file_name
@@ -26,6 +26,16 @@ if TYPE_CHECKING:
 
 SHEET = "sheet.png"
 """Name of the contact sheet in a folder of pictures."""
+
+MOST = 60
+"""Most assets on one sheet."""
+
+_ACROSS = 4
+_THUMBNAIL = 200
+_MARGIN, _HEAD, _GAP = 40, 84, 20
+_TITLE = 26
+"""Most characters of a title beside the verdict."""
+_CELL_WIDTH, _CELL_HEIGHT = 2 * _THUMBNAIL + _GAP, _THUMBNAIL + 66
 
 
 def write_pictures(
@@ -81,17 +91,51 @@ def picture_of(asset: StoredAsset) -> Image:
 
 def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, Scene, str]:
     """Return an asset's id, its picture, and what a contact sheet shows of it."""
-    import matplotlib.style
-
     store = open_store(path)
     asset = store.asset(check.asset_id)
     scene, title = scene_of(asset), title_of(asset)
     alignment = StoredRecords(store).of(check.asset_id).alignment
-    # A user's matplotlibrc must not change the picture.
-    with matplotlib.style.context(["default", STYLE]):
+    with canvas.styled():
         finer = 1 if kind == "png" else 2
         figure = draw_alignment(scene, check, title, subtitle_of(asset), alignment, finer)
         return check.asset_id, in_format(figure, kind), scene, title
+
+
+def draw_sheet(
+    scenes: Sequence[Scene], checks: Sequence[AlignmentCheck], titles: Sequence[str]
+) -> bytes:
+    """Draw at most `MOST` alignments, in this order, as one PNG."""
+    columns = min(_ACROSS, max(len(scenes), 2))
+    rows = -(-len(scenes) // columns)
+    width = 2 * _MARGIN + columns * (_CELL_WIDTH + _GAP) - _GAP
+    height = _HEAD + rows * _CELL_HEIGHT + _MARGIN
+
+    with canvas.styled():
+        figure = new_figure(width, height)
+        write(figure, _MARGIN, 46, f"{len(scenes)} alignments", weight="bold", size=12)
+        write(
+            figure, _MARGIN, 68, "left: PixieVerse voxels by class, SLAT outlined; "
+            f"right: error per voxel, pale 0 to dark {FARTHEST:g} voxels",
+            size=7, color=canvas.MUTED,
+        )  # fmt: skip
+        for number, (scene, check, title) in enumerate(zip(scenes, checks, titles, strict=True)):
+            row, column = divmod(number, columns)
+            x, y = _MARGIN + column * (_CELL_WIDTH + _GAP), _HEAD + row * _CELL_HEIGHT
+            view = views(scene, _THUMBNAIL)[0]
+            images = *outlined(scene, view, scene.placed), error_picture(scene, view)
+            for k, image in enumerate(images):
+                draw_image(figure, x + k * _THUMBNAIL, y, image)
+            colour = canvas.VERDICT_COLOURS[check.verdict]
+            line = y + _THUMBNAIL + 16
+            write(figure, x, line, _cut(title), size=7.5, weight="bold")
+            write(figure, x + _CELL_WIDTH - _GAP, line, str(check.verdict), size=7.5, weight="bold",
+                 color=colour, ha="right")  # fmt: skip
+            write(figure, x, line + 17, check.asset_id[:40], size=6.5, color=canvas.MUTED)
+            worse = min(check.figure("fitness").value, check.figure("fitness_backward").value)
+            sure = check.value("confidence")
+            words = f"confidence {sure:.3f}   fitness {worse:.3f} (the lower of both ways)"
+            write(figure, x, line + 32, words, size=6.5, color=canvas.MUTED)
+        return in_format(figure)
 
 
 def title_of(asset: StoredAsset) -> str:
@@ -116,3 +160,7 @@ def _write(path: Path, content: bytes) -> None:
             f"the picture: cannot be written to {path} ({error.strerror or error}); make room "
             "there, or name another place with --picture, or --picture none"
         ) from error
+
+
+def _cut(title: str) -> str:
+    return title if len(title) <= _TITLE else f"{title[: _TITLE - 1]}…"

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
-from slatprep.inspect.report.content import BINS, page_content
-from slatprep.inspect.report.outcomes import Outcomes, gather_outcomes
+from slatprep.inspect.report.content import page_content
+from slatprep.inspect.report.drawn import BINS, COARSE, FULL, PER_SHEET, Drawn, draw_asset, sheet
+from slatprep.inspect.report.outcomes import gather_outcomes
 from slatprep.inspect.report.page import write_page
-from slatprep.inspect.report.thumbnails import PER_SHEET, sheet, thumbnail
-from slatprep.inspect.report.voxels import COARSE, FULL, encode_asset
-from slatprep.inspect.tallies import Tally, tally
+from slatprep.inspect.tallies import no_tally
 from slatprep.inspect.verify.index import WORDS
+from slatprep.pipeline.previous import SourceStore
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
-from slatprep.store import open_store
-from slatprep.store.reader import Store, StoredAsset
-from slatprep.store.records import StoredRecords, build_in
+from slatprep.store.reader import Store
 from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
 
@@ -37,9 +33,6 @@ ASSETS_LISTED = 50_000
 
 VOXEL_BYTES = 36_000_000
 """Most bytes of voxels at full detail, before base64 makes them a third larger."""
-
-TASK_ASSETS = 16
-"""Assets drawn by one task of a worker."""
 
 
 @dataclass(frozen=True)
@@ -68,21 +61,6 @@ class ReportSummary:
     listed: int
     in_detail: int
     side: int
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """An asset of the store as drawn: thumbnail, and voxels by level of detail.
-
-    For merged labels, ``votes`` is the mean share of votes for a voxel's class. ``spreads`` has the
-    mean spread of each normalised property, NaN where a single annotation has it.
-    """
-
-    index: int
-    thumbnail: NDArray[np.uint8]
-    voxels: dict[int, bytes]
-    votes: float = np.nan
-    spreads: tuple[float, ...] = ()
 
 
 def write_report(
@@ -122,26 +100,25 @@ def write_report(
     _refuse_other_words(store)
     chosen = _chosen(store)
     listed = range(len(store)) if len(store) <= ASSETS_LISTED else chosen
-    outcomes: Outcomes | None = None
-    created = None
+    outcomes = None
     if manifests is not None:
-        created = f"{build_in(manifests).created:%Y-%m-%d}"
         names = {store.ids[row] for row in listed}
         outcomes = gather_outcomes(manifests, store, names, ASSETS_LISTED)
     drawn: list[Drawn] = []
-    tallies: dict[str, Tally] = {}
-    starts = range(0, len(chosen), TASK_ASSETS)
-    tasks = ((store.path, chosen[start : start + TASK_ASSETS]) for start in starts)
-    for some, counts in run_unordered(_draw, tasks, jobs):
-        drawn += some
-        _add(tallies, counts)
+    nothing = no_tally(store.normalization, BINS, contents=store.contents)
+    categories = list(map(str, store.column("category")))
+    tallies = {categories[row]: nothing for row in chosen}
+    source = SourceStore(store.path)
+    for one, counts in run_unordered(draw_asset, ((source, row) for row in chosen), jobs):
+        drawn.append(one)
+        tallies[categories[one.index]] += counts
         if progress:
             progress(len(drawn), len(chosen))
     drawn.sort(key=attrgetter("index"))
     full = sum(len(one.voxels[FULL]) for one in drawn)
     side = FULL if full <= VOXEL_BYTES else COARSE
     agreement = {one.index: (one.votes, one.spreads) for one in drawn if one.spreads}
-    content = page_content(store, outcomes, tallies, listed, chosen, side, created, agreement)
+    content = page_content(store, outcomes, tallies, listed, chosen, side, agreement)
     sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     with writing(str(out), Path(out).parent), staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
@@ -177,36 +154,3 @@ def _chosen(store: Store) -> list[int]:
     doubtful = doubtful[: ASSETS_IN_DETAIL // 2]
     spread = np.linspace(0, total - 1, ASSETS_IN_DETAIL - len(doubtful)).round().astype(int)
     return [int(index) for index in np.union1d(doubtful, spread)]
-
-
-def _draw(path: Path, indices: Sequence[int]) -> tuple[list[Drawn], dict[str, Tally]]:
-    """Draw some assets of a store and tally their voxels by category, in a worker."""
-    store = open_store(path)
-    records = StoredRecords(store)
-    max_distance = store.about.build.parameters.sample.max_distance
-    drawn: list[Drawn] = []
-    tallies: dict[str, Tally] = {}
-    for index in indices:
-        asset = store.asset(store.ids[index])
-        way = records.place_map(asset)
-        voxels = {side: encode_asset(asset, way, max_distance, side) for side in (FULL, COARSE)}
-        drawn.append(Drawn(index, thumbnail(asset), voxels, *_agreement(asset)))
-        field = asset.grid_material, asset.grid_properties
-        slat = asset.material, asset.properties
-        counts = tally(field, slat, store.normalization, BINS, contents=store.contents)
-        _add(tallies, {str(asset.columns["category"]): counts})
-    return drawn, tallies
-
-
-def _agreement(asset: StoredAsset) -> tuple[float, tuple[float, ...]]:
-    """Return votes and spreads of merged labels, as in `Drawn`."""
-    if not asset.merged or not asset.valid.any():
-        return np.nan, ()
-    spread = np.ma.masked_invalid(asset.spread.astype(np.float64)).mean(axis=0)
-    votes = asset.votes[asset.valid].mean(dtype=np.float64)
-    return float(votes), tuple(spread.filled(np.nan).tolist())
-
-
-def _add(tallies: dict[str, Tally], more: Mapping[str, Tally]) -> None:
-    for category, counts in more.items():
-        tallies[category] = tallies[category] + counts if category in tallies else counts

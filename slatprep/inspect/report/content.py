@@ -12,15 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import split_transform
-from slatprep.inspect.pictures.palette import DISTANCE_COLOURS
-from slatprep.inspect.report.outcomes import Outcomes, kinds_of
-from slatprep.inspect.report.thumbnails import COLUMNS, PER_SHEET, VIEWS
-from slatprep.inspect.report.voxels import LEVELS
+from slatprep.inspect.pictures.canvas import DISTANCE_COLOURS
+from slatprep.inspect.report.drawn import BINS, COLUMNS, LEVELS, PER_SHEET, VIEWS
+from slatprep.inspect.report.outcomes import DIGITS, Outcomes, kinds_of, rounded
 from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.pipeline.decoys import measured_errors, told_of
-from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Status
+from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR
 from slatprep.store.reader import Store
 
 # Matplotlib's viridis (CC0) at even steps: its lightness rises with the value, so that
@@ -30,13 +29,12 @@ _PROPERTY_COLOURS = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28
 
 _FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "inlier_rmse",
             "overlap", "valid_share", "ambiguity", "margin")  # fmt: skip
-_DIGITS = 5
+
+_UNTOLD: Mapping[str, Any] = {"ties": [], "reasons": []}
+"""What the table says of an asset without the records of its build."""
 
 Agreement = Mapping[int, tuple[float, tuple[float, ...]]]
 """Mean votes and mean spreads of rows with merged labels."""
-
-BINS = 64
-"""Bins of the histograms of normalised properties, over [-1, 1]."""
 
 
 def page_content(
@@ -46,7 +44,6 @@ def page_content(
     listed: Sequence[int],
     chosen: Sequence[int],
     side: int,
-    created: str | None,
     agreement: Agreement,
 ) -> dict[str, Any]:
     """Return the content of a page, JSON-ready; NaN and unknown values are None.
@@ -58,13 +55,13 @@ def page_content(
     """
     build, labels = store.about.build, store.contents.labels
     states = Counter(map(str, store.column("verdict")))
-    for status, count in (outcomes.absent if outcomes else Counter[Status]()).items():
-        states[_ABSENT[status]] += count
+    if outcomes:
+        states += outcomes.states
     return {
         "title": store.name,
         "name": build.name,
         "build_id": store.about.manifest,
-        "created": created,
+        "created": outcomes and outcomes.created,
         "records": outcomes is not None,
         "versions": build.versions,
         "parameters": [
@@ -120,10 +117,10 @@ def _errors(store: Store) -> dict[str, Any]:
     if measured is None:
         return told
     return told | {
-        "edges": [round(edge, _DIGITS) for edge in measured.edges],
+        "edges": [round(edge, DIGITS) for edge in measured.edges],
         "assets": measured.targets,
         "decoys": measured.counts,
-        "kept": [(one.rate, one.assets, _number(one.score)) for one in measured.kept],
+        "kept": [(one.rate, one.assets, rounded(one.score)) for one in measured.kept],
     }
 
 
@@ -133,7 +130,6 @@ def _properties(
     """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
     total = sum(tallies.values(), start=no_tally(normalization, BINS, contents=store.contents))
-    clipped = outcomes.clipped if outcomes else [0] * len(normalization.ranges)
     return [
         {
             **vars(span),
@@ -143,14 +139,14 @@ def _properties(
             "pixie": [pixie.lo, pixie.hi] if (pixie := published.get(span.name)) else None,
             "field": field.tolist(),
             "slat": slat.tolist(),
-            "clipped": int(count) if outcomes is not None else None,
+            "clipped": int(count) if outcomes else None,
         }
         for span, one, field, slat, count in zip(
             normalization.ranges,
             store.contents.properties,
             total.field.histogram.astype(np.int64),
             total.slat.histogram.astype(np.int64),
-            clipped,
+            store.column("clipped").sum(axis=0),
             strict=True,
         )
     ]
@@ -177,11 +173,10 @@ def _table(
     agreement: Agreement,
 ) -> dict[str, list[Any]]:
     """Return the columns of the table of assets."""
-    known = outcomes.known if outcomes else {}
     rows = np.array(listed, dtype=np.intp)
     ids = [store.ids[row] for row in listed]
-    stored = [known.get(asset_id) for asset_id in ids]
-    absent = [outcome for outcome in known.values() if outcome.status is not Status.OK]
+    told = [outcomes.stored[asset_id] if outcomes else _UNTOLD for asset_id in ids]
+    absent = outcomes.absent if outcomes else []
     transforms = store.column("transform")[rows]
     nearest = [nearest_quarter_turn(transform) for transform in transforms]
     pictures = {index: number for number, index in enumerate(chosen)}
@@ -197,30 +192,20 @@ def _table(
         "transform": (
             [round(float(value), 6) for value in matrix[:3].ravel()] for matrix in transforms
         ),
-        "tied": (outcome and outcome.tied for outcome in stored),
-        "ties": (
-            [[round(number, 6) for number in tie] for tie in outcome.ties] if outcome else []
-            for outcome in stored
-        ),
-        "displacement": (outcome and _number(outcome.displacement) for outcome in stored),
-        "reasons": (list(outcome.reasons) if outcome else [] for outcome in stored),
+        **{
+            name: [own.get(name) for own in told]
+            for name in ("tied", "ties", "displacement", "reasons")
+        },
         "picture": map(pictures.get, listed),
-        "annotations": ((outcome and list(outcome.annotations)) or None for outcome in stored),
-        "votes": (_number(agreement.get(row, (None, ()))[0]) for row in listed),
+        "annotations": (own.get("annotations") for own in told),
+        "votes": (rounded(agreement.get(row, (None, ()))[0]) for row in listed),
         "spreads": (
-            [_number(one) for one in agreement[row][1]] if row in agreement else None
+            [rounded(one) for one in agreement[row][1]] if row in agreement else None
             for row in listed
         ),
-        **{name: map(_number, store.column(name)[rows].tolist()) for name in _FIGURES},
+        **{name: map(rounded, store.column(name)[rows].tolist()) for name in _FIGURES},
     }
-    of_absent: dict[str, list[Any]] = {
-        "id": [outcome.asset_id for outcome in absent],
-        "category": [outcome.category for outcome in absent],
-        "state": [_ABSENT[outcome.status] for outcome in absent],
-        "reasons": [list(outcome.reasons) for outcome in absent],
-    }
-    blank = [None] * len(absent)
-    columns = {name: [*own, *of_absent.get(name, blank)] for name, own in of_stored.items()}
+    columns = {name: [*own, *(one.get(name) for one in absent)] for name, own in of_stored.items()}
     kinds = kinds_of(reason for own in columns["reasons"] for reason in own)
     columns["kinds"] = [[kinds[reason] for reason in own] for own in columns["reasons"]]
     return columns
@@ -254,11 +239,3 @@ def _in_words(rotation: NDArray[np.float64]) -> str:
         axis = int(np.argmax(np.abs(column)))
         words.append(f"{name}→{'+' if column[axis] > 0 else '−'}{'xyz'[axis]}")  # noqa: RUF001
     return " ".join(words)
-
-
-# Not "failed", which is a verdict on an alignment: these were not aligned at all.
-_ABSENT = {Status.FAILED: "not built", Status.SKIPPED: "skipped"}
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else round(value, _DIGITS)

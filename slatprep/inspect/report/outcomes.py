@@ -6,9 +6,9 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.records import Place, Status
@@ -19,58 +19,39 @@ from slatprep.store.records import StoredRecords, build_in
 MOST_TIES = 8
 """Most tied placements of an asset on the page."""
 
+DIGITS = 5
+"""Decimal places of numbers on the page."""
+
+# Not "failed", which is a verdict on an alignment: these were not aligned at all.
+_ABSENT = {Status.FAILED: "not built", Status.SKIPPED: "skipped"}
+
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The outcome of one asset.
-
-    Attributes
-    ----------
-    asset_id, category : str
-        From its record.
-    status : Status
-        ``ok`` if it is in the store.
-    reasons : tuple of str
-        Why it is not in the store, or why its verdict is not ``good``.
-    tied : int
-        Distinct placements that fit about as well as the best.
-    displacement : float or None
-        Largest distance [voxel] between the best placement and a tied one; None without ties.
-    ties : tuple of tuple of float
-        Transforms of the first `MOST_TIES` tied placements, each as three rows of four numbers.
-    annotations : tuple of int
-        Number of annotations that were merged and of all; empty for a single annotation.
-    """
-
-    asset_id: str
-    category: str
-    status: Status
-    reasons: tuple[str, ...]
-    tied: int
-    displacement: float | None
-    ties: tuple[tuple[float, ...], ...] = ()
-    annotations: tuple[int, ...] = ()
+Columns = dict[str, Any]
+"""What the table on the page says of one asset, by the names of its columns."""
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """The outcomes of a build: sums over all assets, and each asset on the page.
+    """The outcomes of a build: each asset on the page, and how many are not in the store.
 
     Attributes
     ----------
-    known : dict of str to Outcome
-        By id, assets that the page lists, whether in the store or not.
-    clipped : ndarray of int64, shape (P,)
-        Values outside the range, by property, of all assets.
-    absent : Counter
-        Assets that are not in the store, by status.
+    created : str
+        Day of the build.
+    stored : dict of str to Columns
+        By id, what records say of the assets of the store that the page lists.
+    absent : list of Columns
+        Assets that are not in the store, sorted by id.
+    states : Counter
+        All of those, by state.
     """
 
-    known: dict[str, Outcome]
-    clipped: NDArray[np.int64]
-    absent: Counter[Status]
+    created: str
+    stored: dict[str, Columns]
+    absent: list[Columns]
+    states: Counter[str]
 
 
 def gather_outcomes(
@@ -87,17 +68,43 @@ def gather_outcomes(
             f"{manifests} holds the records of build {build.id[:12]!r}, the store was written by "
             f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests"
         )
-    known = {
-        one.asset_id: Outcome(one.asset_id, one.category, one.status, (one.reason,), 0, None)
-        for one in build.failed[:most_absent]
+    records = (record for record in StoredRecords(store) if record.asset_id in listed)
+    failed = sorted(build.failed[:most_absent], key=lambda one: one.asset_id)
+    states = {state: build.statuses.get(str(status), 0) for status, state in _ABSENT.items()}
+    return Outcomes(
+        created=f"{build.created:%Y-%m-%d}",
+        stored={record.asset_id: _columns_of(record) for record in records},
+        absent=[
+            {
+                "id": one.asset_id,
+                "category": one.category,
+                "state": _ABSENT[one.status],
+                "reasons": [one.reason],
+            }
+            for one in failed
+        ],
+        states=+Counter(states),
+    )
+
+
+def _columns_of(record: AssetRecord) -> Columns:
+    placements, merged = record.alignment.placements, record.merged
+    return {
+        "reasons": list(record.judgement.reasons),
+        # Distinct placements that fit about as well as the best, and the first of their transforms.
+        "tied": len(placements),
+        "ties": [
+            [round(number, 6) for number in one.transform[:3].ravel().tolist()]
+            for one in placements[:MOST_TIES]
+        ],
+        "displacement": rounded(max((one.displacement for one in placements), default=None)),
+        "annotations": [sum(not one.left_out for one in merged), len(merged)] if merged else None,
     }
-    for record in StoredRecords(store):
-        if record.asset_id in listed:
-            known[record.asset_id] = _outcome(record)
-    absent = Counter({status: build.statuses.get(str(status), 0) for status in Status})
-    del absent[Status.OK]
-    clipped = store.column("clipped").sum(axis=0)
-    return Outcomes(dict(sorted(known.items())), clipped, +absent)
+
+
+def rounded(value: float | None) -> float | None:
+    """Return a number with as many digits as the page has; None where it is not finite."""
+    return None if value is None or not np.isfinite(value) else round(value, DIGITS)
 
 
 def kind_of(reason: str) -> str:
@@ -129,19 +136,3 @@ def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
 
 def _fault_of(reason: str) -> str:
     return re.sub(r"^\S*[/\\.]\S*: ", "", reason.partition("; expected")[0])
-
-
-def _outcome(record: AssetRecord) -> Outcome:
-    placements, merged = record.alignment.placements, record.merged
-    return Outcome(
-        record.asset_id,
-        record.category,
-        record.status,
-        reasons=record.judgement.reasons,
-        tied=len(placements),
-        displacement=max((placement.displacement for placement in placements), default=None),
-        ties=tuple(
-            tuple(placement.transform[:3].ravel().tolist()) for placement in placements[:MOST_TIES]
-        ),
-        annotations=(sum(not one.left_out for one in merged), len(merged)) if merged else (),
-    )

@@ -6,7 +6,6 @@ asset's values and record, and finally the source files that the records name.
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +13,7 @@ from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import asset_findings
 from slatprep.inspect.verify.index import index_findings
 from slatprep.inspect.verify.manifests import manifest_findings, moved, source_roots
+from slatprep.pipeline.previous import SourceStore
 from slatprep.records import Place, SourceRoots
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import AttributesError
@@ -25,8 +25,6 @@ from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
 __all__ = ["Finding", "SourceRoots", "Verification", "verify_store"]
-
-ASSETS_IN_TASK = 8
 
 
 @dataclass(frozen=True)
@@ -131,14 +129,13 @@ def verify_store(
         findings.add(Finding("asset", "", str(error), "readable ids and offsets"))
         rows = []
     hashed, total = 0, len(rows)
-    run, compared = uuid.uuid4().hex, roots if sources else None
-    starts = range(0, total, ASSETS_IN_TASK)
-    tasks = ((store.path, rows[k : k + ASSETS_IN_TASK], compared, run) for k in starts)
+    source, compared = SourceStore(store.path), roots if sources else None
+    tasks = ((source, row, compared) for row in rows)
     for done, (own, count) in enumerate(run_unordered(asset_findings, tasks, jobs), 1):
         findings |= set(own)
         hashed += count
         if progress:
-            progress(min(done * ASSETS_IN_TASK, total), total)
+            progress(done, total)
     if folder is not None:
         try:
             findings |= set(manifest_findings(store, folder, None if sample is None else rows))

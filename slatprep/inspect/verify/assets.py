@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +18,7 @@ from slatprep.judge import voxel_confidence
 from slatprep.judge.evidence import labels_hold
 from slatprep.normalize import normalize_change
 from slatprep.pipeline.fingerprint import code_fingerprint
-from slatprep.pipeline.previous import PLACE_TOLERANCE
+from slatprep.pipeline.previous import PLACE_TOLERANCE, SourceStore
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
     LATENT_ROLES,
@@ -33,10 +33,9 @@ from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.layout import RECORD_ARRAY
-from slatprep.store.reader import Store, StoredAsset, open_store
+from slatprep.store.reader import Store, StoredAsset
 from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import RecordError, columns_of, digest_of
-from slatprep.store.records import StoredRecords
 from slatprep.store.shard_reader import DamagedFileError
 
 CONFIDENCE_TOLERANCE = 1e-5
@@ -44,50 +43,40 @@ CONFIDENCE_TOLERANCE = 1e-5
 
 
 def asset_findings(
-    path: Place, rows: Sequence[int], roots: SourceRoots | None, run: str
+    source: SourceStore, row: int, roots: SourceRoots | None
 ) -> tuple[list[Finding], int]:
-    """Return the faults of some assets (rows) of a store, and the number of sources compared.
+    """Return the faults of an asset of a store, and the number of its sources compared.
 
-    Sources are compared if `roots` is given. `run` is unique to this verification: a worker caches
-    opened stores and digests, and files may have changed since an earlier run.
+    Sources are compared if `roots` is given.
     """
-    store, records = _opened(path, run)
-    findings: list[Finding] = []
-    sources = 0
-    for row in rows:
-        asset_id = store.ids[row]
-        try:
-            asset = store.asset(asset_id)
-            own = list(value_findings(asset)) or list(lookup_findings(asset))
-            findings += own
-        except DamagedFileError as error:
-            findings.append(Finding(error.file, asset_id, error.fault, error.expected))
-            continue
-        except StoreError as error:
-            findings.append(Finding("asset", asset_id, str(error), "an asset that can be read"))
-            continue
-        try:
-            record = records.read(row)
-        except RecordError as error:
-            findings += fault_findings(RECORD_ARRAY, asset_id, error)
-            continue
-        except StoreError as error:
-            findings.append(Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row"))
-            continue
-        try:
-            findings += record_findings(asset, record, records.text(row).encode())
-        except DamagedFileError as error:
-            findings.append(Finding(error.file, asset_id, error.fault, error.expected))
-            continue
-        if not own:  # From invalid values no confidence can be computed.
-            findings += confidence_findings(asset, record)
-        if roots is not None:
-            changed = list(source_findings(record, roots, run))
-            findings += changed
-            sources += len(record.sources)
-            if record.merged and not (own or changed):
-                findings += merged_findings(asset, record, roots)
-    return findings, sources
+    store, asset_id = source.store, source.store.ids[row]
+    try:
+        asset = store.asset(row)
+        findings = list(value_findings(asset)) or list(lookup_findings(asset))
+    except DamagedFileError as error:
+        return [Finding(error.file, asset_id, error.fault, error.expected)], 0
+    except StoreError as error:
+        return [Finding("asset", asset_id, str(error), "an asset that can be read")], 0
+    sound = not findings
+    try:
+        record = source.records.read(row)
+    except RecordError as error:
+        return [*findings, *fault_findings(RECORD_ARRAY, asset_id, error)], 0
+    except StoreError as error:
+        return [*findings, Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row")], 0
+    try:
+        findings += record_findings(asset, record, source.text(row))
+    except DamagedFileError as error:
+        return [*findings, Finding(error.file, asset_id, error.fault, error.expected)], 0
+    if sound:  # From invalid values no confidence can be computed.
+        findings += confidence_findings(asset, record)
+    if roots is None:
+        return findings, 0
+    changed = list(source_findings(record, roots, source))
+    findings += changed
+    if record.merged and sound and not changed:
+        findings += merged_findings(asset, record, roots)
+    return findings, len(record.sources)
 
 
 def value_findings(asset: StoredAsset) -> Iterator[Finding]:
@@ -221,7 +210,9 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
         yield Finding("voxel/confidence", asset.asset_id, what, expected)
 
 
-def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterator[Finding]:
+def source_findings(
+    record: AssetRecord, roots: SourceRoots, store: SourceStore
+) -> Iterator[Finding]:
     """Yield findings on sources that are missing or differ from the record."""
     for source in record.sources:
         try:
@@ -240,7 +231,7 @@ def source_findings(record: AssetRecord, roots: SourceRoots, run: str) -> Iterat
             else:
                 file, _ = storage_of(root).locate(path)
                 size = storage_of(file).size()
-                digest = _digest(file, run) if size == source.size else ""
+                digest = _digest(file, store) if size == source.size else ""
             if size != source.size:
                 what = f"has {size} of {source.size} bytes"
             elif digest != source.sha256:
@@ -318,13 +309,8 @@ def _equal(said: object, held: object) -> bool:
     return bool(said == held)
 
 
-@lru_cache(maxsize=1)
-def _opened(path: Place, run: str) -> tuple[Store, StoredRecords]:
-    store = open_store(path)
-    return store, StoredRecords(store)
-
-
 @lru_cache(maxsize=64)
-def _digest(path: Place, run: str) -> str:
-    # Cached, since one file may hold the SLATs of many assets.
+def _digest(path: Place, _store: SourceStore) -> str:
+    # Cached, since one file may hold the SLATs of many assets; as long as the store is verified,
+    # since files may have changed since an earlier run.
     return file_digest(path)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from slatprep.inspect.pictures import palette
+from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.scene import rgb
 from slatprep.records import CLASS_COLOURS, MATERIAL_CLASSES
 
@@ -46,11 +46,11 @@ def test_classes_differ_for_everyone(seen_by):
 
 @pytest.mark.parametrize("seen_by", SEEN_BY)
 def test_distances_only_darken(seen_by):
-    lightness = [lab(colour, seen_by)[0] for colour in palette.DISTANCE_COLOURS]
+    lightness = [lab(colour, seen_by)[0] for colour in canvas.DISTANCE_COLOURS]
     assert (np.diff(lightness) < -10).all()
 
 
-@pytest.mark.parametrize("colour", [palette.INK, palette.MUTED, *palette.VERDICT_COLOURS.values()])
+@pytest.mark.parametrize("colour", [canvas.INK, canvas.MUTED, *canvas.VERDICT_COLOURS.values()])
 def test_text_stands_out_from_the_paper(colour):
     def luminance(name: str) -> float:
         value = rgb(name)
@@ -58,4 +58,4 @@ def test_text_stands_out_from_the_paper(colour):
         return float(TO_XYZ[1] @ linear)
 
     # 4.5 is what WCAG 2 asks for text.
-    assert (luminance(palette.PAPER) + 0.05) / (luminance(colour) + 0.05) >= 4
+    assert (luminance(canvas.PAPER) + 0.05) / (luminance(colour) + 0.05) >= 4
