@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from slatprep.geometry.frames import VOXEL_SIZE, apply_transform
-from slatprep.inspect.pictures.palette import DISTANCE_COLOURS, INK, MUTED
+from slatprep.inspect.pictures.canvas import DISTANCE_COLOURS, INK, MUTED
 from slatprep.store.reader import StoredAsset
 
 MOST = 0.5
