@@ -66,6 +66,11 @@ def mixed_build(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Bui
 
 
 @pytest.fixture
+def store(mixed_build: BuildSummary) -> Path:
+    return Path(str(mixed_build.store))
+
+
+@pytest.fixture
 def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
     """Return a copy of the store that may be changed, its records beside it."""
     shutil.copytree(mixed_build.records.parent, tmp_path / "copy.manifests")

@@ -61,7 +61,7 @@ TESTS = {
     "geometry/frames": ["geometry"],
     "geometry/voxels": ["geometry/test_voxel_sets.py", "geometry/test_frames.py"],
     "geometry/nearest": ["geometry/test_nearest.py"],
-    "geometry/fill": ["geometry/test_fill.py"],
+    "geometry/fill": ["geometry/test_distance.py"],
     "geometry/distance": ["geometry/test_distance.py"],
     "store/reader": ["store/test_assets_of_store.py"],
     "store/assets": ["store/test_assets_of_store.py"],

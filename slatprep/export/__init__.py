@@ -1,6 +1,6 @@
 """Export a store as PLY, HDF5, WebDataset shards, npz of TRELLIS and VoMP, or USD.
 
-Each format is one module. `export_store` chooses the assets, passes batches of them to the
+`export_store` chooses the assets, passes batches of them to the
 format's writer, and moves the result into place when it is complete.
 """
 
@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from slatprep.errors import ConfigError
@@ -26,17 +26,17 @@ from slatprep.workers.local import run_unordered
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
 
 FORMATS = {
-    "ply": "slatprep.export.ply",
-    "hdf5": "slatprep.export.hdf5",
-    "webdataset": "slatprep.export.webdataset",
-    "npz": "slatprep.export.npz",
-    "voxel_data": "slatprep.export.voxel_data",
-    "usd": "slatprep.export.usd",
+    "ply": "slatprep.export.ply:writer",
+    "hdf5": "slatprep.export.hdf5:writer",
+    "webdataset": "slatprep.export.npz:webdataset",
+    "npz": "slatprep.export.npz:trellis",
+    "voxel_data": "slatprep.export.npz:voxel_data",
+    "usd": "slatprep.export.usd:writer",
 }
-"""Name of each format and its module; to add a format, add its line here.
+"""Name of each format and its function; to add a format, add its line here.
 
-The module's ``writer`` takes the open store, the ids of the exported assets and the
-`ExportOptions`, and returns a `Writer`.
+The function takes the open store, the ids of the exported assets and the `ExportOptions`, and
+returns a `Writer`.
 """
 
 _Entry = dict[str, Any]
@@ -114,7 +114,7 @@ def export_store(
         verdicts = () if assets else USABLE
     ids = choose_ids(opened, assets, verdicts)
     tell = progress or (lambda done, total: None)
-    writer: Writer = import_module(FORMATS[format]).writer(opened, ids, options)
+    writer: Writer = resolve_name(FORMATS[format])(opened, ids, options)
     about = _about(opened, format)
     entries: list[_Entry] = []
     notes = writer.notes

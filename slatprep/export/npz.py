@@ -1,21 +1,37 @@
-"""The layout that TRELLIS's dataset of structured latents loads, with the targets added.
+"""npz files of arrays: for TRELLIS's dataset, in shards for WebDataset, and for VoMP's scripts.
 
-The root has ``latents/<model>/<sha256>.npz`` and ``metadata.csv``. By its columns TRELLIS
-chooses and finds the files (its ``DATASET.md`` and ``trellis/datasets``).
+TRELLIS's dataset of structured latents loads ``latents/<model>/<sha256>.npz``, which it chooses and
+finds by the columns of ``metadata.csv`` (its ``DATASET.md`` and ``trellis/datasets``); the targets
+are added. A shard is a tar file in which the members with one key are a sample. The array
+``voxel_data`` has the fields of VoMP's dataset and of its predictions
+(https://github.com/nv-tlabs/vomp). Its scripts for warp.fem, Newton and libuipc look them up at
+their own points.
 """
 
 from __future__ import annotations
 
 import csv
+import io
+import tarfile
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import orjson
 
 from slatprep.errors import ConfigError
-from slatprep.export.formats import TARGETS, Exported, ExportOptions, Writer, with_merged
+from slatprep.export.formats import (
+    TARGETS,
+    Exported,
+    ExportOptions,
+    Points,
+    Writer,
+    annotated_points,
+    describe_columns,
+    with_merged,
+)
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
 
@@ -25,7 +41,7 @@ _NO_WORDS = frozenset({"na", "null", "none", "true", "false"})
 """Words that pandas, with which TRELLIS reads `METADATA`, does not read as text."""
 
 
-def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+def trellis(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of TRELLIS's layout; see `slatprep.export.FORMATS`.
 
     Raises ConfigError if the model's name cannot name a folder.
@@ -35,10 +51,10 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
         raise ConfigError(
             f"latent_model is {model!r}; expected an encoder's name, of letters, digits, . _ and -"
         )
-    return Writer(partial(write, model), finish=partial(write_metadata, model))
+    return Writer(partial(write_latents, model), finish=partial(write_metadata, model))
 
 
-def write(
+def write_latents(
     model: str, directory: Path, number: int, assets: Iterable[StoredAsset]
 ) -> Iterator[Exported]:
     """Write an npz for each asset: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
@@ -88,3 +104,70 @@ def _stem(asset_id: str) -> str:
         if name.casefold() not in _NO_WORDS:
             return name
     return f"%{ord(name[0]):02X}{name[1:]}"
+
+
+def webdataset(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+    """Return the writer of shards of `options.shard_size` assets; see `slatprep.export.FORMATS`."""
+    return Writer(write_shard, batch=options.shard_size)
+
+
+def write_shard(directory: Path, number: int, assets: Iterable[StoredAsset]) -> Iterator[Exported]:
+    """Write shard `number` with ``<key>.json`` and ``<key>.npz`` for each asset.
+
+    The key is the asset's id with dots encoded: for WebDataset a key ends at the first dot.
+    """
+    shard = f"shard-{number:06d}.tar"
+    with tarfile.open(directory / shard, "w") as tar:
+        for asset in assets:
+            key = file_name(asset.asset_id, dots=False)
+            about = {**describe_columns(asset), "transform": asset.transform.tolist()}
+            _add(tar, f"{key}.json", orjson.dumps(about))
+            names = with_merged(asset.store, "coords", "feats", *TARGETS, "distance", "place")
+            # Not compressed, since a training loop reads it repeatedly.
+            packed = io.BytesIO()
+            np.savez(packed, **{name: getattr(asset, name) for name in names})
+            _add(tar, f"{key}.npz", packed.getvalue())
+            yield Exported(asset, shard, len(asset.coords))
+
+
+def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+    # A new TarInfo has no owner and time 0, so the bytes are reproducible.
+    member = tarfile.TarInfo(name)
+    member.size = len(content)
+    tar.addfile(member, io.BytesIO(content))
+
+
+VOXEL = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+        ("youngs_modulus", "<f4"), ("poissons_ratio", "<f4"), ("density", "<f4"),
+        ("segment_id", "<U32"),
+    ]
+)  # fmt: skip
+"""The fields of a voxel: centre in the unit cube, E in Pa, density in kg/m^3, name of class."""
+
+FOLDER = "voxels"
+
+
+def voxel_data(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
+    """Return the writer of an npz for each asset; see `slatprep.export.FORMATS`."""
+    return Writer(partial(write_voxels, points=options.points or "slat"))
+
+
+def write_voxels(
+    directory: Path, number: int, assets: Iterable[StoredAsset], *, points: Points
+) -> Iterator[Exported]:
+    """Write ``voxels/<id>_with_materials.npz`` of each asset, and yield what was written."""
+    (directory / FOLDER).mkdir(exist_ok=True)
+    for asset in assets:
+        there = annotated_points(asset, points)
+        rows = np.zeros(len(there.material), dtype=VOXEL)
+        for axis, name in enumerate("xyz"):
+            rows[name] = there.in_slat[:, axis]
+        solid = there.solid(asset)
+        for column, name in enumerate(("youngs_modulus", "density", "poissons_ratio")):
+            rows[name] = solid[:, column]
+        rows["segment_id"] = np.array(asset.store.contents.labels, dtype="<U32")[there.material]
+        name = f"{FOLDER}/{file_name(asset.asset_id)}_with_materials.npz"
+        np.savez_compressed(directory / name, voxel_data=rows)
+        yield Exported(asset, name, len(rows))

@@ -239,15 +239,10 @@ def write_prediction(
     with staged(path) as file, file.open("wb") as stream:
         np.savez_compressed(
             stream,
-            coords=field.coords,
-            properties=field.properties,
-            properties_si=field.properties_si,
-            material=field.material,
-            probabilities=field.probabilities,
+            **vars(field),
             ranges=np.array([[span.lo, span.hi] for span in checkpoint.normalization.ranges]),
             columns=np.array([span.name for span in checkpoint.normalization.ranges]),
             checkpoint=np.array(checkpoint.sha256),
-            seconds=np.array(field.seconds),
             **checkpoint.contents.latents.beside_voxels,  # type: ignore[arg-type]
         )
     return path

@@ -4,7 +4,6 @@ import io
 import json
 import sys
 from importlib.metadata import version
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -161,15 +160,3 @@ def test_bar_on_a_terminal_counts_assets_and_tells_the_time_left_once_it_can(mon
     counted = "3/8 · 0:00 · 0:00 left" if done == 3 else f"{done}/8"
     assert ("starting" if done is None else counted) in shown
     assert ("left" in shown) is (done == 3)
-
-
-def test_commands_print_through_one_function():
-    """Which escapes what a terminal would obey."""
-    folder = Path(str(module.__file__)).parent
-    printing = [p.name for p in folder.glob("*.py") if "click.echo(" in p.read_text("utf-8")]
-    assert printing == ["streams.py"]
-    assert (folder / "streams.py").read_text("utf-8").count("click.echo(") == 1
-    emitting = [p.name for p in folder.glob("*.py") if " emit(" in p.read_text("utf-8")]
-    assert sorted(emitting) == ["output.py", "streams.py"]
-    # `say`, and a table that rich has drawn of escaped cells.
-    assert Path(str(module.__file__)).read_text("utf-8").count(" emit(") == 2

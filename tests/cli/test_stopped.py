@@ -39,12 +39,13 @@ def _run(step: str, number: signal.Signals, line: list[str], said: Path) -> None
 
 
 @pytest.fixture(scope="module")
-def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the store of one asset, and its records."""
+def sources(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """One asset, and in a folder the store of another, with its records."""
     old = Dataset(tmp_path_factory.mktemp("old"))
     old.add("z", seed=3)
-    build_store(old.parameters("pixie"), old.root / "stores" / "s.zarr")
-    return old.root / "stores"
+    made = Dataset(tmp_path_factory.mktemp("made")).having("a")
+    build_store(old.parameters("pixie"), made.root / "stores" / "s.zarr")
+    return made
 
 
 @pytest.mark.parametrize(
@@ -55,15 +56,14 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("store replaced", signal.SIGINT),
     ],
 )
-def test_a_signal_at_a_step(step, number, stores, undisturbed, tmp_path):
-    dataset, _ = undisturbed
-    folder = Path(shutil.copytree(stores, tmp_path / "stores"))
+def test_a_signal_at_a_step(step, number, sources, tmp_path):
+    folder = Path(shutil.copytree(sources.root / "stores", tmp_path / "stores"))
     out = folder / "s.zarr"
     before, there = tree(out), set(folder.iterdir())
     said = tmp_path / "said"
     line = [
-        "build-store", "--pixieverse", str(dataset.root / "pixieverse"),
-        "--slat", str(dataset.root / "slat"), "--ranges", "pixie", "--out", str(out),
+        "build-store", "--pixieverse", str(sources.root / "pixieverse"),
+        "--slat", str(sources.root / "slat"), "--ranges", "pixie", "--out", str(out),
     ]  # fmt: skip
     forked = multiprocessing.get_context("fork").Process(
         target=_run, args=(step, number, line, said)
@@ -76,5 +76,5 @@ def test_a_signal_at_a_step(step, number, stores, undisturbed, tmp_path):
     assert told in said.read_text()
     # Finished assets are kept in the work folder for the next build, which removes it.
     assert set(folder.iterdir()) - {folder / ".s.zarr.work"} == there
-    build_store(dataset.parameters("pixie"), out)
+    build_store(sources.parameters("pixie"), out)
     assert set(folder.iterdir()) == there

@@ -228,12 +228,7 @@ def test_latents_have_the_published_statistics_or_tell_materials_apart(kind):
 
 
 def test_every_category_has_a_builder_and_every_object_an_id():
-    names = {asset(k, 0).category for k in range(len(CATALOGUE))}
-    assert names == {
-        "tree", "flowers", "shrubs", "grass", "fruit", "rubber_ducks_and_toys", "sport_balls",
-        "soda_cans", "metal_crates", "sand", "snow_and_mud", "jello_block", "rocks",
-        "water-like_bodies",
-    }  # fmt: skip
+    assert {asset(k, 0).category for k in range(len(CATALOGUE))} == set(CATALOGUE)
     ids = [object_id(0, k) for k in range(100)] + [object_id(1, k) for k in range(100)]
     assert len(set(ids)) == 200
     assert all(len(i) == 32 and set(i) <= set("0123456789abcdef") for i in ids)

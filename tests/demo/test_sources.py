@@ -96,9 +96,7 @@ def test_latents_of_every_encoder_are_carried(tmp_path, encoder):
 TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-@pytest.mark.parametrize(
-    "source", ["pixieverse", "pixie-predictions", "physxnet", "voxels-npz", "vomp"]
-)
+@pytest.mark.parametrize("source", ["pixieverse", "physxnet", "voxels-npz"])
 def test_a_wrong_frame_of_any_source_is_caught(tmp_path, source):
     made = make_demo(tmp_path / "demo", 2, 0, levels=(0,), source=source)
     text = made.config.read_text()

@@ -15,7 +15,6 @@ import nbformat
 import pytest
 from click.testing import CliRunner
 from nbclient import NotebookClient
-from support.commands import run
 
 from slatprep.cli.commands import COMMANDS, slatprep
 
@@ -170,36 +169,3 @@ def test_asset_ids_complete_from_the_store(mixed_build, monkeypatch):
     later = "slatprep export mixed.zarr --format npz --asset cup --asset d"
     assert complete(later).splitlines() == ["plain,dog"]
     assert complete("slatprep export no.zarr --asset b").strip() == ""
-
-
-def test_wrong_asset_is_answered_with_the_one_it_might_be(mixed_build, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    store = mixed_build.store
-    for words in (
-        ("export", store, "--format", "npz", "--out", "x"),
-        ("check-alignment", "--store", store),
-    ):
-        told = run(*words, "--asset", "cuo", code=2).stderr
-        assert "has no asset 'cuo'; did you mean cup?" in told
-        assert len(told.splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ("npz --points grid", "--points is for --format ply or voxel_data or usd, not npz"),
-        ("ply --shard-size 3", "--shard-size is for --format webdataset"),
-    ],
-)
-def test_option_without_effect_is_refused(options, said, mixed_build, tmp_path):
-    words = ("export", mixed_build.store, "--out", tmp_path / "x", "--format", *options.split())
-    assert said in run(*words, code=2).stderr
-
-
-def test_quiet_export_prints_nothing(mixed_build, tmp_path):
-    words = ("export", mixed_build.store, "--format", "ply", "--frame", "pixieverse")
-    loud = run(*words, "--out", tmp_path / "a")
-    assert "have no world bounds" in loud.stderr and "Exported to" in loud.stdout
-    quiet = run(*words, "--out", tmp_path / "b", "-q")
-    assert quiet.output == "" and len(list((tmp_path / "b").glob("*.ply"))) == 5

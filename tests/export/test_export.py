@@ -10,7 +10,7 @@ import tarfile
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.commands import run
 from support.exports import bytes_of, index_of
@@ -25,6 +25,9 @@ from slatprep.readers import discover, read_latents
 from slatprep.readers.splits import Shares, split_objects
 from slatprep.storage.files import file_name
 from slatprep.store import Store
+
+KINDS = ("hdf5", "npz")
+"""A format of one file, and one of a folder."""
 
 # What an asset's points may be: material id to E, density, nu.
 TRUTH = {stuff[0]: stuff[1:] for stuff in (JELLY, METAL)}
@@ -108,7 +111,7 @@ def test_bytes_repeat_whatever_the_jobs(format, store, tmp_path):
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["export"]
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", KINDS)
 def test_what_is_no_export_is_never_replaced(format, store, tmp_path):
     folder, file = tmp_path / "mine", tmp_path / "mine.txt"
     folder.mkdir()
@@ -124,7 +127,7 @@ def test_what_is_no_export_is_never_replaced(format, store, tmp_path):
     assert (folder / "thesis.txt").read_text() == file.read_text() == "years of work"
 
 
-@pytest.mark.parametrize("format", ["ply", "webdataset", "npz"])
+@pytest.mark.parametrize("format", ["webdataset", "npz"])
 def test_what_lies_beside_an_export_stays(format, store, tmp_path):
     out, fresh = tmp_path / "export", tmp_path / "fresh"
     export_store(store, out, format, assets=["cup", "dog"])
@@ -187,7 +190,7 @@ def test_a_disk_that_is_full_ends_no_process(store, tmp_path):
         assert line.endswith(" []")
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", KINDS)
 def test_a_link_stays_and_the_store_is_left_alone(format, store, tmp_path):
     there, link = tmp_path / "disk" / "export", tmp_path / "link"
     export_store(store, there, format, assets=["cup"])
@@ -202,7 +205,7 @@ def test_a_link_stays_and_the_store_is_left_alone(format, store, tmp_path):
     assert not (store / "voxel" / "export").exists()
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", KINDS)
 def test_a_failed_export_leaves_the_old_one(format, store, tmp_path, monkeypatch):
     out = tmp_path / "export"
     export_store(store, out, format, assets=["cup"])
@@ -256,19 +259,8 @@ def test_splits_go_out_apart_and_together_they_are_all(store, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-HOSTILE = ["..", "../../etc/passwd", "a b", "-rf", "~", "__key__", "x" * 300, "häß", "a/b", "."]
-
-
-def test_hostile_ids_become_file_names(tmp_path):
-    for dots in (True, False):
-        names = [file_name(asset_id, dots=dots) for asset_id in [*HOSTILE, "a.b", "a%2Eb"]]
-        assert len({name.casefold() for name in names}) == len(names)
-        for name in names:
-            (tmp_path / name).write_text("x")
-            assert (tmp_path / name).resolve().parent == tmp_path.resolve()
-            assert name.isascii() and name[0] not in ".-_~" and (dots or "." not in name)
-
-
+@example({"..", "../../etc/passwd", "a b", "-rf", "~", "__key__", "a/b", ".", "a.b", "a%2Eb"}, True)
+@example({"x" * 300, "häß", "a.b", "a%2Eb"}, False)
 @given(
     ids=st.sets(st.text(st.characters(codec="utf-8"), min_size=1, max_size=300), max_size=8),
     dots=st.booleans(),
@@ -278,6 +270,7 @@ def test_any_ids_become_distinct_plain_names(ids, dots):
     assert len(names) == len(ids)
     for name in names:
         assert re.fullmatch(r"[A-Za-z0-9%][A-Za-z0-9%._~-]*", name) and len(name) < 250
+        assert dots or "." not in name
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -15,7 +15,7 @@ from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
 from slatprep.errors import ConfigError
 from slatprep.export import ExportOptions, export_store
-from slatprep.export.bins import bin_materials
+from slatprep.export.usd import bin_materials
 from slatprep.pipeline.dataset import build_store
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 

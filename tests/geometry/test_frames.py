@@ -19,7 +19,7 @@ from slatprep.geometry.frames import (
     split_transform,
     voxel_centres,
 )
-from slatprep.geometry.voxels import boundary, bounding_box, occupancy_of, shown_in_cells, voxels_of
+from slatprep.geometry.voxels import occupancy_of, shown_in_cells, voxels_of
 
 numbers = st.floats(-2, 2)
 poses = st.tuples(
@@ -92,30 +92,10 @@ def test_of_mirrored_points_the_nearest_similarity_is_no_mirror():
     np.testing.assert_allclose(found[:3, :3], scale * np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
 
 
-def test_the_boundary_of_a_box_by_counting():
-    box = np.zeros((64, 64, 64), dtype=bool)
-    box[10:20, 10:22, 10:24] = True
-    assert boundary(box).sum() == 10 * 12 * 14 - 8 * 10 * 12
-    full = np.ones((64, 64, 64), dtype=bool)
-    assert boundary(full).sum() == 64**3 - 62**3
-    single = occupancy_of([[5, 6, 7]])
-    np.testing.assert_array_equal(boundary(single), single)
-
-
 @given(st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=50))
 def test_voxels_and_occupancy_are_two_forms_of_one_set(voxels):
     occupancy = occupancy_of(np.array(sorted(voxels)))
     assert {tuple(v) for v in voxels_of(occupancy).tolist()} == voxels
-    box = bounding_box(occupancy)
-    assert occupancy[box].sum() == len(voxels)
-    table = np.array(sorted(voxels))
-    assert [s.start for s in box] == table.min(axis=0).tolist()
-    assert [s.stop for s in box] == (table.max(axis=0) + 1).tolist()
-
-
-def test_an_empty_set_has_no_box():
-    with pytest.raises(ValueError, match="empty"):
-        bounding_box(np.zeros((64, 64, 64), dtype=bool))
 
 
 def test_displacement_by_hand():
@@ -132,7 +112,7 @@ def test_displacement_by_hand():
     )
 
 
-@pytest.mark.parametrize("side", [2, 31, 32, 48, 64, 96, 128, 256])
+@pytest.mark.parametrize("side", [2, 31, 64, 96, 128, 256])
 def test_cells_of_voxels_of_any_grid_are_those_that_centres_say(side):
     voxels = np.unique(np.random.default_rng(side).integers(0, side, (300, 3)), axis=0)
     voxels = np.random.default_rng(0).permutation(voxels).astype(np.uint8)

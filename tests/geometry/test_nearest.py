@@ -26,92 +26,45 @@ def test_the_nearest_voxel_is_a_kd_tree_s(count, seed, spread, side):
     np.testing.assert_allclose(apart, distance, atol=1e-9)
 
 
-def test_of_equally_near_voxels_the_first_is_taken():
-    voxels = np.array([[11, 10, 10], [9, 10, 10], [10, 11, 10]], dtype=np.uint8)
-    for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
-        _, index = Lattice(voxels[order]).nearest(voxel_centres([[10, 10, 10]]))
-        assert index.tolist() == [0]
-
-
-def test_of_two_voxels_as_near_as_the_searched_cells_reach_the_first_is_taken():
-    """One of them, 3.5 voxels off, lies among the cells around the point, the other beyond."""
-    for first, second in ((14, 7), (7, 14)):
-        voxels = np.array([[first, 30, 30], [second, 30, 30]], dtype=np.uint8)
-        distance, index = Lattice(voxels).nearest(voxel_centres([[10.5, 30, 30]]))
-        assert (distance.tolist(), index.tolist()) == ([3.5], [0])
-
-
-@pytest.mark.parametrize("limit", [0.5, 1.5, 3.0, np.inf])
-def test_the_ends_of_the_grid_are_far_apart(limit):
-    """Against brute force around faces, edges and corners: no look-up runs over into another row.
-
-    Of each pair of opposite ends one alone has voxels, along a line here and there.
-    """
+def ends() -> tuple[np.ndarray, np.ndarray]:
+    """Voxels at one of each pair of opposite ends alone; places around both, between cells."""
     ends = np.array([[0, 9, 9], [63, 30, 30], [9, 0, 40], [40, 63, 9], [20, 9, 0], [9, 50, 63],
-                     [0, 0, 20], [63, 20, 63]], dtype=np.uint8)  # fmt: skip
+                     [0, 0, 20], [63, 20, 63]])  # fmt: skip
     voxels = np.unique(np.concatenate([ends, np.roll(ends, 1, axis=1)]), axis=0)
-    across = (64 * (voxels == 0)) - 64 * (voxels == 63).astype(int)
+    opposite = voxels + 64 * (voxels == 0) - 64 * (voxels == 63)
     nearby = np.argwhere(np.ones((5, 5, 5), dtype=bool)) - 2
-    opposite = (voxels + across)[:, None] + nearby
-    index = np.concatenate([opposite, voxels[:, None] + nearby]).reshape(-1, 3) + 0.25
-    squares = ((index[:, None] - voxels.astype(int)) ** 2).sum(axis=2)
-    within = squares.min(axis=1) <= limit**2
-    distance, found = Lattice(voxels).nearest(voxel_centres(index), limit=limit)
-    assert within.any()
-    np.testing.assert_array_equal(found, np.where(within, squares.argmin(axis=1), -1))
-    np.testing.assert_allclose(distance[within], np.sqrt(squares.min(axis=1)[within]))
+    around = np.concatenate([opposite, voxels])[:, None] + nearby
+    return voxels, 4 * around.reshape(-1, 3) + 1
 
 
-@pytest.mark.parametrize("limit", [0.5, 1.0, 3.0, 6.5, 9.0, np.inf])
-def test_every_cell_of_the_grid_finds_the_first_of_its_nearest_voxels(limit):
-    """Against all distances by brute force, in whole numbers: near, far, and often tied."""
-    voxels = np.array(
-        [[3, 3, 3], [3, 9, 3], [40, 40, 41], [40, 40, 40], [63, 0, 63], [3, 3, 15]], dtype=np.uint8
-    )
-    cells = np.argwhere(np.ones((64, 64, 64), dtype=bool))
-    squares = ((cells[:, None] - voxels.astype(int)) ** 2).sum(axis=2)
-    least = squares.min(axis=1)
-    first = squares.argmin(axis=1)
-    distance, index = Lattice(voxels).nearest(voxel_centres(cells), limit=limit)
-    within = least <= limit**2
-    assert within.any()
-    np.testing.assert_array_equal(index, np.where(within, first, -1))
-    np.testing.assert_allclose(distance[within], np.sqrt(least[within]), rtol=1e-12)
-    assert np.isinf(distance[~within]).all()
+def few() -> tuple[np.ndarray, np.ndarray]:
+    """Few voxels, 12 apart and beside one another; the whole grid, far off and often tied."""
+    voxels = np.array([[3, 3, 3], [3, 9, 3], [40, 40, 41], [40, 40, 40], [63, 0, 63], [3, 3, 15]])
+    return voxels, 4 * np.argwhere(np.ones((64, 64, 64), dtype=bool))
 
 
-@pytest.mark.parametrize("limit", [3.5, 9.0, np.inf])
-def test_half_way_between_voxels_the_first_of_the_nearest_is_found(limit):
-    """Against brute force in doubled whole numbers, where every axis has ties."""
+def blocks() -> tuple[np.ndarray, np.ndarray]:
+    """Blocks of eight voxels in any order; places half-way between cells, in the grid and out."""
     rng = np.random.default_rng(3)
-    corners = rng.integers(0, 63, (60, 3))
     around = np.argwhere(np.ones((2, 2, 2), dtype=bool))
-    voxels = np.unique((corners[:, None] + around).reshape(-1, 3), axis=0).astype(np.uint8)
+    voxels = np.unique((rng.integers(0, 63, (60, 1, 3)) + around).reshape(-1, 3), axis=0)
     rng.shuffle(voxels)
-    doubled = rng.integers(-20, 148, (4000, 3))
-    squares = ((doubled[:, None] - 2 * voxels.astype(int)) ** 2).sum(axis=2)
-    within = squares.min(axis=1) <= (2 * limit) ** 2
-    distance, index = Lattice(voxels).nearest(voxel_centres(doubled / 2), limit=limit)
+    return voxels, 2 * rng.integers(-20, 148, (4000, 3))
+
+
+@pytest.mark.parametrize("limit", [0.5, 1.0, 2.5, 3.5, 6.5, 9.0, np.inf])
+@pytest.mark.parametrize("held", [ends, few, blocks])
+def test_of_equally_near_voxels_within_a_limit_the_first_is_found(held, limit):
+    """Against brute force in whole numbers, quarters of a voxel."""
+    voxels, quarters = held()
+    squares = ((quarters[:, None] - 4 * voxels) ** 2).sum(axis=2)
+    least = squares.min(axis=1)
+    within = least <= (4 * limit) ** 2
+    places = voxel_centres(quarters / 4)
+    distance, index = Lattice(voxels.astype(np.uint8)).nearest(places, limit=limit)
     np.testing.assert_array_equal(index, np.where(within, squares.argmin(axis=1), -1))
-    np.testing.assert_allclose(distance[within], np.sqrt(squares.min(axis=1)[within]) / 2)
-
-
-def test_beyond_the_limit_nothing_is_found():
-    voxels = np.array([[0, 0, 0]], dtype=np.uint8)
-    points = voxel_centres([[2, 0, 0], [3, 0, 0], [63, 63, 63]])
-    distance, index = Lattice(voxels).nearest(points, limit=2.0)
-    assert distance.tolist() == [2.0, np.inf, np.inf]
-    assert index.tolist() == [0, -1, -1]
-
-
-@pytest.mark.parametrize("limit", [0.5, 1.0, 2.5, 3.5])
-def test_just_at_the_limit_a_voxel_is_found_wherever_it_lies(limit):
-    """Along a whole line of the grid, from either side."""
-    for last in range(4, 60):
-        voxels = np.array([[last, 30, 30]], dtype=np.uint8)
-        points = voxel_centres([[last - limit, 30, 30], [last + limit, 30, 30]])
-        distance, index = Lattice(voxels).nearest(points, limit=limit)
-        assert (distance.tolist(), index.tolist()) == ([limit] * 2, [0, 0])
+    np.testing.assert_allclose(distance[within], np.sqrt(least[within]) / 4, rtol=1e-12)
+    assert within.any() and np.isinf(distance[~within]).all()
 
 
 class _Counted:
@@ -150,25 +103,6 @@ def test_a_point_that_is_far_off_costs_few_looks(held):
 def test_an_empty_set_is_refused():
     with pytest.raises(ValueError, match="empty"):
         Lattice(np.zeros((0, 3), dtype=np.uint8))
-
-
-def test_two_voters_outvote_a_nearer_one():
-    # The point sits 0.4 of the way from voxel 30 to 31: class 2 is nearest, but
-    # class 5 speaks from x = 31 and from both sides in y.
-    voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
-    labels = np.array([2, 5, 5, 5], dtype=np.uint8)
-    point = voxel_centres([[30, 20, 20]]) + np.array([[0.4, 0, 0]]) / 64
-    weight = {2: np.exp(-2 * 0.4**2), 5: np.exp(-2 * 0.6**2) + 2 * np.exp(-2 * (0.6**2 + 1))}
-    assert weight[5] < weight[2]  # with a width of 0.5 the nearest one still holds
-    assert Lattice(voxels).vote(point, labels, 0.5).tolist() == [0]
-    assert Lattice(voxels).vote(point, labels, 1.0).tolist() == [1]  # with 1.0 it does not
-
-
-def test_a_vote_without_voters_is_empty():
-    voxels = np.array([[0, 0, 0]], dtype=np.uint8)
-    assert Lattice(voxels).vote(
-        voxel_centres([[5, 5, 5]]), np.zeros(1, np.uint8), 0.5
-    ).tolist() == [-1]
 
 
 def test_each_vote_is_of_its_own_labels():

@@ -12,9 +12,7 @@ from slatprep.geometry.voxels import (
     bounding_box,
     filled,
     flat_index,
-    occupancy_of,
     outer_boundary,
-    shown_in_cells,
     voxels_at,
     voxels_of,
 )
@@ -82,18 +80,3 @@ def test_ground_may_slope_along_any_axis():
     centres = (np.argwhere(full) + 0.5) / 64 - 0.5
     left = above(full, Ground(normal, 0.1))
     np.testing.assert_array_equal(left.reshape(-1), centres @ normal > 0.1)
-
-
-def test_cells_of_a_coarser_and_of_a_finer_grid_by_hand():
-    # A voxel of 32 is eight cells; of 128 eight voxels are one, which shows the first of them.
-    cells, row = shown_in_cells(np.array([[3, 0, 31], [0, 0, 0]], np.uint8), 32)
-    corners = np.argwhere(np.ones((2, 2, 2), dtype=bool))
-    np.testing.assert_array_equal(cells, np.concatenate([corners, corners + np.array([6, 0, 62])]))
-    assert row.tolist() == [1] * 8 + [0] * 8
-    fine = np.array([[127, 5, 8], [1, 1, 1], [0, 1, 0], [126, 4, 9]], np.uint8)
-    cells, row = shown_in_cells(fine, 128)
-    assert (cells.tolist(), row.tolist()) == ([[0, 0, 0], [63, 2, 4]], [1, 0])
-    assert np.argwhere(occupancy_of(fine, 128)).tolist() == [[0, 0, 0], [63, 2, 4]]
-    same = np.array([[7, 1, 0], [0, 63, 2]], np.uint8)
-    cells, row = shown_in_cells(same, 64)
-    assert cells is same and row.tolist() == [0, 1]

@@ -3,9 +3,21 @@
 from pathlib import Path
 
 import pytest
+import torch
 from support.synthetic import Dataset
 
+from slatprep.learn import decoder
 from slatprep.pipeline.dataset import build_store
+
+# Nothing but time depends on the size of the decoder that is trained.
+decoder.SIZES["tiny"] = decoder.DecoderSize(24, 2, 2)
+
+
+@pytest.fixture(autouse=True)
+def _as_it_was() -> None:
+    """Compute on one thread and by any algorithm, whatever a command has set."""
+    torch.use_deterministic_algorithms(False)
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

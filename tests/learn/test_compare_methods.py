@@ -1,5 +1,6 @@
 """Predicted grids by Pixie's protocol and at SLAT voxels, against numpy on the files themselves."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -173,28 +174,11 @@ def save(path: Path, array: np.ndarray) -> None:
 
 BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "missing": (lambda path: path.unlink(), "no grid for id 'b'"),
-    "text": (lambda path: path.write_bytes(b"nothing") and None, "no readable npy"),
     "short": (lambda path: path.write_bytes(path.read_bytes()[:-8]) and None, "truncated"),
-    "pickle": (lambda path: save(path, np.array([Path()], object)), "pickle"),
     "shape": (lambda path: save(path, np.zeros((11, 32, 32, 32), np.float32)), "has shape"),
-    "nan": (lambda path: save(path, np.full((11, 64, 64, 64), np.nan, "f4")), "score is NaN"),
     "class": (lambda path: save(path, np.full((4, 64, 64, 64), 9.0)), "unknown class 9"),
-    "inf": (
-        lambda path: save(path, np.where(np.arange(4)[:, None, None, None] < 3, np.inf, 0)
-                          + np.zeros((4, 64, 64, 64))),
-        "youngs_modulus inf",
-    ),
-    "si": (
-        lambda path: save(path, np.array([7850.0, 1e6, 0.3, 0.0])[:, None, None, None]
-                          + np.zeros((4, 64, 64, 64))),
-        "a prediction, channels first, is normalised to [-1, 1]",
-    ),
-    "negative": (lambda path: save(path, np.full((64, 64, 64, 4), -1.0)), "youngs_modulus -1"),
-    "two": (
-        lambda path: save(path.with_name("sample_1_pred.npy"), np.load(path)),
-        "2 samples",
-    ),
-}  # fmt: skip
+    "two": (lambda path: save(path.with_name("sample_1_pred.npy"), np.load(path)), "2 samples"),
+}
 
 
 @pytest.mark.parametrize("fault", BAD)
@@ -303,28 +287,19 @@ def test_published_spreads_are_those_printed():
     assert all(list(score.spreads) in ([], list(METRICS)) for score in SLAT_PHYS_TABLE)
 
 
-def stuffed(case: Case, root: Path, change: Callable[[np.ndarray], np.ndarray]) -> Comparison:
-    """Measure the true grids after a change, in the form of a prediction or of a raw grid."""
-    for name in NAMES:
-        written(root / f"{name}.npy", change(case.grids[name].astype(np.float64)))
-    return compared(case, root)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda grid: np.moveaxis(grid, -1, 0), "a prediction, channels first, is normalised"),
         (lambda grid: grid / [1e3, 1e9, 1, 1], "look like GPa and g/cm"),
         (lambda grid: grid * [1, 1, 100, 1], "Poisson's ratio"),
+        # What no material has is a prediction nevertheless.
+        (lambda grid: np.where(grid[..., 3:] == 7, grid, [7850, 2e6, 0.3, 1]), None),
     ],
 )
 def test_values_that_are_no_prediction_are_refused(case, tmp_path, change, words):
-    with pytest.raises(InputError, match=words):
-        stuffed(case, tmp_path, change)
-
-
-def test_a_method_that_predicts_what_no_material_has_is_measured(case, tmp_path):
-    wrong = stuffed(
-        case, tmp_path, lambda grid: np.where(grid[..., 3:] == 7, grid, [7850, 2e6, 0.3, 1])
-    )
-    assert not wrong.problems
+    for name in NAMES:
+        written(tmp_path / f"{name}.npy", change(case.grids[name].astype(np.float64)))
+    refusal = pytest.raises(InputError, match=words) if words else contextlib.nullcontext()
+    with refusal:
+        assert compared(case, tmp_path).problems == []

@@ -96,31 +96,6 @@ def test_against_a_plain_computation(learn_store, predicted, form):
     assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
 
 
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
-        ({"E": np.zeros(3)}, "expected properties"),
-        ({"properties": np.zeros((5, 3))}, "properties has shape"),
-        ({"properties": None, "material": 9}, "class 9"),
-        ({"properties": np.nan}, "not all finite"),
-        ({"properties": 7850.0}, "properties reach 7850; expected normalised properties"),
-        ({"properties": None, "coords": 1}, "other voxels"),
-    ],
-)
-def test_bad_predictions_are_named(learn_store, tmp_path, arrays, message):
-    store = open_store(learn_store)
-    count = store.rows(0)[1]
-    shapes = {"properties": (count, 3), "material": (count,), "coords": (count, 3)}
-    whole = {
-        name: value if isinstance(value, np.ndarray) else np.full(shapes[name], value or 0.0)
-        for name, value in arrays.items()
-    }
-    np.savez(tmp_path / f"{store.ids[0]}.npz", **whole)
-    with pytest.raises(InputError, match=message) as caught:
-        evaluate_store(tmp_path, learn_store, None)
-    assert store.ids[0] in str(caught.value)
-
-
 def test_command(learn_store, predicted, tmp_path):
     some = tmp_path / "some"
     shutil.copytree(predicted["npz"], some)

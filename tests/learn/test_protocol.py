@@ -79,7 +79,7 @@ def test_evaluate_outside_a_run_says_which_split_it_takes(learn_store, tmp_path)
 @pytest.mark.parametrize("steps", [1, 3, 4])
 def test_steps_end_where_they_are_told_to(learn_store, tmp_path, steps):
     chosen = TrainParameters(
-        size="small", steps=steps, epochs=1, batch_size=1, accumulate=2, learning_rate=2e-3,
+        size="tiny", steps=steps, epochs=1, batch_size=1, accumulate=2, learning_rate=2e-3,
         shares=Shares(0.4, 0.3, 0.3), keep="last",
     )  # fmt: skip
     batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=chosen.shares), 1))
@@ -100,7 +100,7 @@ def test_steps_end_where_they_are_told_to(learn_store, tmp_path, steps):
 
 def test_a_run_of_steps_goes_on_to_the_bit(learn_store, tmp_path):
     chosen = TrainParameters(
-        size="small", steps=5, batch_size=2, learning_rate=2e-3, shares=Shares(0.4, 0.3, 0.3)
+        size="tiny", steps=5, batch_size=2, learning_rate=2e-3, shares=Shares(0.4, 0.3, 0.3)
     )
     train(learn_store, tmp_path / "whole", chosen)
     train(learn_store, tmp_path / "parts", chosen, stop_after=1)
@@ -114,7 +114,7 @@ def test_a_run_of_steps_goes_on_to_the_bit(learn_store, tmp_path):
 
 def test_the_last_weights_need_no_validation(learn_store, tmp_path):
     shares = Shares(0.9, 0.0, 0.1)
-    two = TrainParameters(size="small", epochs=2, learning_rate=2e-3, shares=shares, keep="last")
+    two = TrainParameters(size="tiny", epochs=2, learning_rate=2e-3, shares=shares, keep="last")
     summary = train(learn_store, tmp_path / "run", two)
     assert summary.best_epoch == 1 and summary.references == {}
     assert all(math.isnan(record.val_loss) for record in summary.history)
@@ -124,7 +124,7 @@ def test_the_last_weights_need_no_validation(learn_store, tmp_path):
     assert all(torch.equal(last[key], kept[key]) for key in last)
     assert not (tmp_path / "run" / "curve.png").exists()
     with pytest.raises(ConfigError, match="--keep last"):
-        train(learn_store, tmp_path / "other", TrainParameters(size="small", shares=shares))
+        train(learn_store, tmp_path / "other", TrainParameters(size="tiny", shares=shares))
     words = ("train", learn_store, "--out", tmp_path / "shown", "--steps", "2")
     kept = ("--keep", "last", "--split-by", "pixie", "--shares", "1,0,0")
     assert "loss nan" not in run(*words, *FAST, *kept).output

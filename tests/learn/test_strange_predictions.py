@@ -26,7 +26,7 @@ from slatprep.readers.splits import Shares
 from slatprep.store import open_store
 
 SHARES = Shares(0.4, 0.3, 0.3)
-SHORT = TrainParameters(size="small", epochs=1, shares=SHARES)
+SHORT = TrainParameters(size="tiny", epochs=1, shares=SHARES)
 
 
 @pytest.fixture
@@ -76,6 +76,12 @@ def test_evaluation_reads_nothing_outside(hostile, tmp_path):
         ({"coords": np.nan}, "has coordinate nan"),
         ({"coords": 1.5}, "has coordinate 1.5"),
         ({"properties": "pairs"}, "has dtype"),
+        ({"properties": np.zeros((5, 3))}, "properties has shape"),
+        ({"properties": np.nan}, "not all finite"),
+        ({"properties": 7850.0}, "properties reach 7850; expected normalised properties"),
+        ({"material": 9}, "class 9"),
+        ({"coords": 1}, "other voxels"),
+        ({"E": np.zeros(3)}, "expected properties"),
     ],
 )
 @pytest.mark.parametrize("form", ["npz", "hdf5", "zarr"])
@@ -83,10 +89,10 @@ def test_values_that_are_no_prediction_are_named(learn_store, tmp_path, arrays, 
     count = open_store(learn_store).rows(0)[1]
     shapes = {"properties": (count, 3), "material": (count,), "coords": (count, 3)}
     shapes |= {"logits": (count, 8)}
-    whole = {"properties": np.zeros((count, 3))}
+    whole = {} if "E" in arrays else {"properties": np.zeros((count, 3))}
     for name, value in arrays.items():
-        whole[name] = np.full(shapes[name], value)
-        if value == "pairs":
+        whole[name] = value if isinstance(value, np.ndarray) else np.full(shapes[name], value)
+        if isinstance(value, str) and value == "pairs":
             whole[name] = np.zeros(shapes[name], [("a", "i4"), ("b", "i4")])
     path = tmp_path / "p"
     if form == "npz":
@@ -103,8 +109,9 @@ def test_values_that_are_no_prediction_are_named(learn_store, tmp_path, arrays, 
             text = values.astype("U4") if values.dtype.kind == "U" else values
             root.create_array(name, data=text, config={"write_empty_chunks": True})
         message = rf"{message}|data_type is"
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=message) as caught:
         evaluate_store(path, learn_store, None)
+    assert f"{path}/a" in str(caught.value).replace(f"{path} [a", f"{path}/a")
 
 
 def test_what_lies_beside_a_prediction_is_not_unpacked(learn_store, tmp_path):

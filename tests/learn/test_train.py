@@ -26,17 +26,12 @@ from slatprep.storage.atomic import take_lock
 
 SHARES = Shares(0.4, 0.3, 0.3)
 SHORT = TrainParameters(
-    size="small", epochs=3, batch_size=2, accumulate=2, learning_rate=2e-3, shares=SHARES,
-    augmentation="upright", seed=1,
+    size="tiny", epochs=3, batch_size=2, accumulate=2, learning_rate=2e-3, shares=SHARES,
+    augmentation="upright", seed=1, precision="fp32",
 )  # fmt: skip
 
 
 SMALL = ("--size", "small", "--threads", "1")
-
-
-@pytest.fixture(autouse=True)
-def _default_torch() -> None:
-    torch.use_deterministic_algorithms(False)
 
 
 def test_loss_by_hand():
@@ -155,11 +150,11 @@ def test_wrong_runs_are_named(learn_store, tmp_path):
 
 def test_accumulation_is_the_gradient_of_the_mean(learn_store, tmp_path):
     # Equal batches by equal weights: all objects in one step, one at a time, in any order.
-    base = dataclasses.replace(SHORT, epochs=1, batch_size=1, accumulate=100, precision="fp32")
+    base = dataclasses.replace(SHORT, epochs=1, batch_size=1, accumulate=100)
     train(learn_store, tmp_path / "run", dataclasses.replace(base, augmentation="none"))
     moved = weights_of(tmp_path / "run" / LAST)
     torch.manual_seed(base.seed)
-    model = make_decoder("small")
+    model = make_decoder("tiny")
     optimizer = torch.optim.AdamW(model.parameters(), lr=base.learning_rate)
     dataset = SlatDataset(learn_store, "train", shares=SHARES)
     batches = [collate([dataset[k]]) for k in range(len(dataset))]
@@ -246,7 +241,7 @@ def test_commands_train_and_evaluate(learn_store, tmp_path):
 
 def test_the_command_weighs_voxels_by_their_confidence(learn_store, tmp_path):
     losses = []
-    for number, weigh in enumerate(([], ["--weigh-by-confidence"], ["--weigh-by-confidence"])):
+    for number, weigh in enumerate(([], ["--weigh-by-confidence"])):
         out = tmp_path / str(number)
         words = (*SMALL, "--epochs", "1", "--shares", "0.4,0.3,0.3", *weigh)
         told = document("train", learn_store, "--out", out, *words)
@@ -254,8 +249,7 @@ def test_the_command_weighs_voxels_by_their_confidence(learn_store, tmp_path):
         losses.append(epoch["train_loss"])
         kept = json.loads((out / "run.json").read_text())
         assert kept["weigh_by_confidence"] is bool(weigh)
-    # Means with weights that sum to one: which is larger depends on where the doubtful voxels are.
-    assert losses[1] == losses[2] != losses[0]
+    assert losses[0] != losses[1]
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(learn_store, tmp_path):
@@ -318,9 +312,10 @@ def test_precision_is_that_of_the_processor(flags, precision, monkeypatch):
 
 
 def test_a_run_goes_on_in_the_precision_it_began_with(learn_store, tmp_path, monkeypatch):
+    moved = dataclasses.replace(SHORT, precision="auto")
     for found in ("fp32", "bf16"):  # As if it were moved to another machine.
         monkeypatch.setattr(module, "precision_of", lambda device, found=found: found)
-        train(learn_store, tmp_path / "run", SHORT, stop_after=1)
+        train(learn_store, tmp_path / "run", moved, stop_after=1)
         assert json.loads((tmp_path / "run" / "run.json").read_text())["precision"] == "fp32"
 
 

@@ -97,6 +97,10 @@ def test_text_costs_no_more_than_its_size(elements, body, said, tmp_path):
     refused(file, said, 30e6)
 
 
+def test_a_file_of_no_particles_is_refused(tmp_path):
+    refused(_ply(tmp_path / "p.ply", f"element vertex 0\n{XYZ}", b""), "holds no particles")
+
+
 def test_a_large_file_is_refused_without_a_copy(tmp_path):
     rows = np.zeros((2_000_000, 3), dtype="<f4")
     rows[-1, 1] = np.nan
@@ -123,7 +127,10 @@ def test_faces_behind_the_vertices_are_counted_and_left_unread(tmp_path):
     refused(torn, "announces more rows than it has")
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\n", b"\0" * 2**21])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"ply\n", b"\0" * 2**21, b"ply\nformat ascii 1.0\nelement face 0\nend_header\n"],
+)
 def test_a_header_without_end_is_refused(content, tmp_path):
     (tmp_path / "p.ply").write_bytes(content)
     refused(tmp_path / "p.ply", "is no readable PLY with vertices")

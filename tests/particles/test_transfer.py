@@ -15,7 +15,6 @@ from slatprep.export import ExportOptions, export_store
 from slatprep.particles.fields import VoxelField, predicted_field
 from slatprep.particles.read import read_particles
 from slatprep.particles.transfer import transfer
-from slatprep.pipeline.dataset import BuildSummary
 
 # As TRELLIS names and orders the fields of a Gaussian (`construct_list_of_attributes`).
 GAUSSIAN = [
@@ -46,11 +45,6 @@ def run_wrong(*words: object) -> str:
     return result.stderr
 
 
-@pytest.fixture
-def store(mixed_build: BuildSummary) -> Path:
-    return mixed_build.store
-
-
 @pytest.fixture(scope="module")
 def true_parts(mixed: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Return the SLAT voxels of `cup` with their true class, from its grid."""
@@ -65,17 +59,25 @@ def particles_near(coords: np.ndarray, count: int, reach: float) -> np.ndarray:
     return (chosen + 0.5 + rng.uniform(-reach, reach, (count, 3))) / 64 - 0.5
 
 
-def test_gaussians_get_the_material_of_their_voxel(store, true_parts, tmp_path):
+@pytest.mark.parametrize("tool", ["trellis", "sam3d"])
+def test_gaussians_of_either_tool_get_the_material_of_their_voxel(
+    tool, store, true_parts, tmp_path
+):
     coords, material = true_parts
     positions = particles_near(coords, 3000, 0.45)
-    saved = write_gaussians(tmp_path / "g.ply", positions)
-    words = ("--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
-    summary = run(tmp_path / "g.ply", *words)
-    assert summary["axes"] == "trellis" and summary["far"] == 0
+    saved = (write_gaussians if tool == "trellis" else as_sam3d)(tmp_path / "g.ply", positions)
+    words = ("--store", store, "--asset", "cup", "--out")
+    summary = run(tmp_path / "g.ply", *words, tmp_path / "m.ply")
+    assert summary["axes"] == ("trellis" if tool == "trellis" else "slat") and summary["far"] == 0
+    told = commands.run(
+        "transfer", tmp_path / "g.ply", *words, tmp_path / "s.ply", "--frame", "slat"
+    )
+    assert ("read as SAM 3D Objects saves them" in told.stderr) == (tool == "sam3d")
 
-    vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
+    vertex, in_slat = (plyfile.PlyData.read(tmp_path / f"{n}.ply")["vertex"] for n in "ms")
     # Row for row the Gaussians of the file, so that the two lie on each other.
     np.testing.assert_array_equal(np.column_stack([vertex[a] for a in "xyz"]), saved)
+    np.testing.assert_allclose(np.column_stack([in_slat[a] for a in "xyz"]), positions, atol=1e-7)
     voxel = {tuple(c): m for c, m in zip(coords.tolist(), material.tolist(), strict=True)}
     truth = [voxel[tuple(v)] for v in np.floor((positions + 0.5) * 64).astype(int).tolist()]
     np.testing.assert_array_equal(vertex["material_id"], truth)
@@ -112,26 +114,10 @@ def write_prediction(path: Path, coords: np.ndarray, material: np.ndarray) -> No
     np.savez(path, coords=coords, material=material, properties_si=values)
 
 
-def as_sam3d(path: Path, slat_positions: np.ndarray) -> None:
+def as_sam3d(path: Path, slat_positions: np.ndarray) -> np.ndarray:
     """Write Gaussians as SAM 3D Objects does: TRELLIS's fields, positions as they are."""
     x, y, z = slat_positions.T
-    write_gaussians(path, np.column_stack([x, z, -y]))
-    vertex = plyfile.PlyData.read(path)["vertex"]
-    np.testing.assert_allclose(np.column_stack([vertex[a] for a in "xyz"]), slat_positions)
-
-
-@pytest.mark.parametrize("tool", ["trellis", "sam3d"])
-def test_axes_of_sam3d_are_recognised(tool, store, true_parts, tmp_path):
-    positions = particles_near(true_parts[0], 3000, 0.45).astype(np.float32)
-    (write_gaussians if tool == "trellis" else as_sam3d)(tmp_path / "g.ply", positions)
-    words = (tmp_path / "g.ply", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
-    result = commands.run("transfer", *words)
-    assert ("read as SAM 3D Objects saves them" in result.stderr) == (tool == "sam3d")
-    vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
-    coords, material = true_parts
-    voxel = {tuple(c): m for c, m in zip(coords.tolist(), material.tolist(), strict=True)}
-    cells = np.floor((positions.astype(float) + 0.5) * 64).astype(int).tolist()
-    np.testing.assert_array_equal(vertex["material_id"], [voxel[tuple(cell)] for cell in cells])
+    return write_gaussians(path, np.column_stack([x, z, -y]))
 
 
 @pytest.mark.parametrize("shape", ["ball", "crate"])
@@ -244,21 +230,6 @@ def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path):
     assert "100% of them lie inside the object" in said and "--points grid" in said
 
 
-def test_open3d_reads_the_same_points(store, true_parts, tmp_path):
-    import open3d
-
-    positions = particles_near(true_parts[0], 200, 0.4)
-    saved = write_gaussians(tmp_path / "g.ply", positions)
-    for frame, expected in (("file", saved), ("slat", positions)):
-        words = ("--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
-        run(tmp_path / "g.ply", *words, "--frame", frame)
-        cloud = open3d.t.io.read_point_cloud(str(tmp_path / "m.ply"))
-        np.testing.assert_allclose(cloud.point.positions.numpy(), expected, atol=1e-7)
-        vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
-        for name in ("E", "density", "nu", "conf", "material_id"):
-            np.testing.assert_array_equal(cloud.point[name].numpy()[:, 0], vertex[name])
-
-
 def test_nearest_is_nearest_by_brute_force():
     rng = np.random.default_rng(1)
     cells = rng.choice(64**3, size=400, replace=False)
@@ -338,25 +309,6 @@ def test_plain_points_are_taken_as_they_lie(tmp_path):
         )
     turned = read_particles(tmp_path / "p.npy", axes="trellis")
     np.testing.assert_allclose(turned.in_slat(), positions[:, [0, 2, 1]] * [1, 1, -1])
-
-
-@pytest.mark.parametrize("fault", ["junk", "cut", "empty", "nan", "flat", "faces"])
-def test_particles_that_cannot_be_used_are_named(fault, tmp_path):
-    path = tmp_path / "p.ply"
-    write_gaussians(path, np.full((0 if fault == "empty" else 5, 3), 0.1))
-    if fault == "junk":
-        path.write_bytes(b"not a ply")
-    elif fault == "cut":
-        path.write_bytes(path.read_bytes()[:-30])
-    elif fault == "nan":
-        write_gaussians(path, np.array([[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]]))
-    elif fault == "flat":
-        path = tmp_path / "p.npy"
-        np.save(path, np.zeros((5, 2)))
-    elif fault == "faces":
-        path.write_bytes(b"ply\nformat ascii 1.0\nelement face 0\nend_header\n")
-    with pytest.raises(InputError, match=path.name):
-        read_particles(path)
 
 
 def test_wrong_calls_are_refused_and_nothing_is_lost(store, tmp_path):
