@@ -8,11 +8,9 @@ import zarr
 from support.commands import document, run
 from support.synthetic import SMALL_SHARDS
 
-import slatprep
 from slatprep.errors import InputError
 from slatprep.geometry.frames import make_transform
 from slatprep.inspect.score import TruthScore, score_against_truth, summarise
-from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.records import PIXIEVERSE, Normalization, PropertyRange
 from slatprep.store.writer import create_store, finish_store
 
@@ -221,63 +219,6 @@ def test_places_that_do_not_fit_are_named(tmp_path):
     write_long_truth(tmp_path / "truth", places=LONG_PLACES[:-1])
     with pytest.raises(InputError, match=r"a\.npz: places has shape \(39, 3\)"):
         score_against_truth(tmp_path / "s.zarr", tmp_path / "truth")
-
-
-def independent_score(store: Path, truth_path: Path) -> dict[str, float]:
-    """Compute the same by comparing every place with every annotated voxel."""
-    root = zarr.open_group(store, mode="r")
-    k = [str(i) for i in root["asset/id"][:]].index(truth_path.stem)
-    first, last = (int(v) for v in root["asset/offset"][k : k + 2])
-    truth = np.load(truth_path)
-    grid = root["grid/material"][k]
-    voxels = np.stack(np.nonzero(grid <= 6), axis=1)
-    classes = grid[grid <= 6]
-
-    def back(matrix: np.ndarray) -> np.ndarray:
-        homogeneous = np.ones((last - first, 4))
-        homogeneous[:, :3] = (root["voxel/coords"][first:last] + 0.5) / 64 - 0.5
-        return np.linalg.solve(matrix, homogeneous.T).T[:, :3]
-
-    def nearest(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        asked = (places + 0.5) * 64 - 0.5
-        distance, label = [], []
-        for some in np.array_split(asked, 1 + len(asked) // 400):
-            squared = (voxels**2).sum(axis=1) - 2 * some @ voxels.T + (some**2).sum(axis=1)[:, None]
-            distance.append(np.sqrt(np.maximum(squared.min(axis=1), 0)))
-            label.append(classes[squared.argmin(axis=1)])
-        return np.concatenate(distance), np.concatenate(label)
-
-    true, best = truth["places"], back(truth["transform"])
-    distance, at_true = nearest(true)
-    asked = distance <= 2
-    valid = root["voxel/valid"][first:last]
-    stored = root["voxel/material"][first:last]
-    off = lambda places: 64 * np.sqrt(((places - true) ** 2).sum(axis=1)).mean()  # noqa: E731
-    return {
-        "displacement": off(root["voxel/place"][first:last].astype(float)),
-        "similarity_displacement": off(best),
-        "label_accuracy": ((stored == truth["material"]) & valid)[asked].mean(),
-        "similarity_accuracy": (nearest(best)[1] == truth["material"])[asked].mean(),
-        "truth_own": (at_true == truth["material"])[asked].mean(),
-        "valid_share": valid.mean(),
-    }
-
-
-def test_scores_of_a_built_demo_equal_an_independent_computation(tmp_path):
-    demo = slatprep.make_demo(tmp_path / "demo", assets=1, seed=5, levels=(7,))
-    parameters = BuildParameters(
-        pixieverse=PixieverseSource(root=demo.directory / "pixieverse"),
-        slat=SlatSource(root=demo.directory / "slat"),
-    )
-    slatprep.build_store(parameters, tmp_path / "s.zarr")
-    report = score_against_truth(tmp_path / "s.zarr", demo.directory / "truth")
-    assert len(report.assets) == 1
-    for score in report.assets:
-        expected = independent_score(
-            tmp_path / "s.zarr", demo.directory / "truth" / f"{score.asset_id}.npz"
-        )
-        for name, value in expected.items():
-            assert getattr(score, name) == pytest.approx(value, abs=1e-6), name
 
 
 def test_a_printed_score_fits_a_terminal(tmp_path):

@@ -1,4 +1,4 @@
-"""Names and texts that are not UTF-8 cost their own asset at most, and no traceback."""
+"""What a source can say, UTF-8 or not, costs its own asset at most, and no traceback."""
 
 import json
 import os
@@ -7,26 +7,26 @@ import shutil
 import numpy as np
 import pytest
 from support.commands import run
-from support.trees import records_of
+from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
+from slatprep.store.record import MAX_WARNINGS
 from slatprep.store.records import StoredRecords
 
 BAD = os.fsdecode(b"b\xff")
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_names_that_are_not_utf_8_cost_their_assets_alone(make_dataset, tmp_path, jobs):
+def test_names_that_are_not_utf_8_cost_their_assets_alone(make_dataset, tmp_path):
     dataset = make_dataset("a", "c", "d")
     shutil.copy(dataset.root / "slat/a.npz", dataset.root / "slat" / f"{BAD}.npz")
     grids = dataset.root / "pixieverse"
     (grids / "c").rename(grids / os.fsdecode(b"c\xff"))
     (grids / "d/sample_0").rename(grids / "d" / os.fsdecode(b"sample_d\xff"))
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr", jobs=jobs)
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr", jobs=2)
     assert "a" in open_store(summary.store).ids
     told = " ".join(reason for _, reason in summary.problems)
     assert all(f"{name}\\udcff" in told for name in ("b", "c", "sample_d"))
@@ -99,3 +99,47 @@ def test_a_root_that_is_not_utf_8_is_named(tmp_path):
     config.write_text('[pixieverse]\nroot = "slat"\n[slat]\nroot = "slat"\n')
     with pytest.raises(ConfigError, match=r"pixieverse\.root: .*b\\udcff/slat.*UTF-8"):
         load_parameters(config)
+
+
+def test_more_annotations_than_a_record_holds_cost_their_asset_alone(make_dataset, tmp_path):
+    dataset = make_dataset("a", "b")
+    folder = dataset.root / "pixieverse" / "a"
+    for sample in range(1, 256):
+        (folder / f"sample_{sample}").mkdir()
+        grid = f"sample_{sample}/material_grid.npy"
+        os.link(folder / "sample_0/material_grid.npy", folder / grid)
+    parameters = dataset.parameters("pixie", pixieverse={"samples": "merge"})
+    summary = build_store(parameters, tmp_path / "s.zarr")
+    assert (summary.statuses["ok"], summary.statuses["failed"]) == (1, 1)
+    assert "256 annotations in 257 files" in dict(summary.problems)["a"]
+    assert verify_store(tmp_path / "s.zarr").ok
+
+
+def test_more_warnings_than_a_record_holds_are_counted(make_dataset, tmp_path):
+    dataset = make_dataset("a")
+    grid = dataset.assets["a"].grid
+    grid[tuple(np.argwhere(grid[..., 3] != 7)[0])] = (np.nan, np.nan, np.nan, -1)
+    dataset.write_grid("a", grid)
+    nowhere = {f"bounds_{k}": np.full(3, np.nan) for k in range(256)}
+    np.savez(dataset.root / "pixieverse/a/clip_features.npz", **nowhere)
+    out = tmp_path / "s.zarr"
+    build_store(dataset.parameters("pixie"), out)
+    warnings = StoredRecords(open_store(out)).of("a").warnings
+    assert len(warnings) == MAX_WARNINGS and warnings[-1].endswith("more warnings")
+    assert verify_store(out).ok
+    before = tree(out)
+    build_store(dataset.parameters("pixie"), out)
+    assert tree(out) == before
+
+
+def test_a_record_that_nobody_could_read_costs_its_asset_alone(make_dataset, tmp_path, monkeypatch):
+    """Texts of the bounds are taken into the record as they are."""
+    dataset = make_dataset("a", "b")
+    beside = dataset.root / "pixieverse/a/clip_features.npz"
+    np.savez(beside, **{f"names_{k}": np.array(["x" * 60] * 60) for k in range(40)})
+    monkeypatch.setattr("slatprep.store.record_json.MAX_RECORD_BYTES", 2 * 100_000)
+    out = tmp_path / "s.zarr"
+    summary = build_store(dataset.parameters("pixie"), out)
+    assert (summary.statuses["ok"], summary.statuses["failed"]) == (1, 1)
+    assert "more than a record may hold (1" in dict(summary.problems)["a"]
+    assert verify_store(out).ok

@@ -158,31 +158,18 @@ def test_without_classes_no_accuracy_is_claimed(tmp_path):
     assert np.isfinite(means["mean"])
 
 
-def test_classes_of_a_source_s_own_go_all_the_way_to_scores(tmp_path):
+def test_classes_of_a_source_s_own_are_told_by_their_names(tmp_path):
     own = ["soft wood", "steel"]
-    write(tmp_path, "abcdefgh", classes=own, properties=SOLID)
-    out, trained = tmp_path / "s.zarr", tmp_path / "run"
+    write(tmp_path, "ab", classes=own, properties=SOLID)
+    out = tmp_path / "s.zarr"
     build_store(parameters_of(tmp_path), out)
     store = open_store(out)
     assert store.attributes["material_classes"] == own
-    assert store.contents.n_classes == 2
-    assert not verify_store(out).findings
     found = store_statistics(store)
-    counts = [np.bincount(voxels_of(seed)[2]) for seed in range(8)]
+    counts = np.sum([np.bincount(voxels_of(seed)[2]) for seed in range(2)], axis=0)
     assert [one.name for one in found.classes] == own
-    shares = np.sum(counts, axis=0) / np.sum(counts)
-    assert [found.total.field.classes[name] for name in own] == pytest.approx(shares)
-    summary = train(out, trained, TrainParameters(size="small", epochs=1, precision="fp32"))
-    assert 0 <= summary.history[-1].val_accuracy <= 1
-    scores = evaluate_store(trained / "predictions", out, split=None)
-    assert np.isfinite(scores.overall.means["accuracy"])
-    predicted = tmp_path / "predicted"
-    source = ("--checkpoint", trained / "best.pt", "--out", predicted)
-    run("predict", tmp_path / "slat", *source)
-    with np.load(next(predicted.glob("*.npz"))) as file:
-        assert file["probabilities"].shape[1] == 2
-        np.testing.assert_array_equal(file["material"], file["probabilities"].argmax(axis=1))
-    assert export_store(out, tmp_path / "ply", "ply").assets == 8
+    shares = [found.total.field.classes[name] for name in own]
+    assert shares == pytest.approx(counts / counts.sum())
     with pytest.raises(StoreError, match=r"has classes of its own \(soft wood, steel\)"):
         stored_field(store, "a")
     # Another name is another table: nothing is taken over.

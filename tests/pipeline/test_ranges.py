@@ -49,7 +49,7 @@ def of(dataset: Dataset, **normalize: object) -> BuildParameters:
 
 def test_percentiles_are_numpy_s_whatever_the_jobs_and_what_was_there(make_dataset, tmp_path):
     dataset, out = noisy(make_dataset("a", "b", "c"), "a", "b", "c"), tmp_path / "s.zarr"
-    for lo, hi in ((0, 100), (0.5, 97.25), (50, 51), (1, 99)):
+    for lo, hi in ((0, 100), (0.5, 97.25), (1, 99)):
         build_store(of(dataset, ranges=f"p{lo}-p{hi}"), out)
         np.testing.assert_allclose(ranges_of(out), expected(dataset, "abc", lo, hi), rtol=1e-12)
         assert open_store(out).normalization.source == f"p{lo}-p{hi}"

@@ -53,8 +53,13 @@ def test_a_mapping_that_is_held_open(tmp_path, closed):
     assert tree(tmp_path / "s.zarr") != first
 
 
-@pytest.mark.parametrize("of", ["first build", "update"])
-@pytest.mark.parametrize("what", ["folder", "file", "link", "root that is a link"])
+@pytest.mark.parametrize(
+    ("what", "of"),
+    [
+        *((what, "first build") for what in ("folder", "file", "link", "root that is a link")),
+        ("file", "update"),
+    ],
+)
 def test_sources_that_are_exchanged_while_they_are_read_and_put_back(
     tmp_path, monkeypatch, what, of
 ):

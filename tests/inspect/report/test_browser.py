@@ -36,9 +36,9 @@ def wait(condition: Callable[[], object]) -> None:
         time.sleep(0.05)
 
 
-def open_page(browser: Chrome, report: Report) -> None:
+def open_page(browser: Chrome, report: Report, end: str = "") -> None:
     browser.get("about:blank")  # else a change of the address' end loads nothing
-    browser.get(report.path.as_uri())
+    browser.get(report.path.as_uri() + end)
     ready = "return performance.getEntriesByName('slatprep-ready').length"
     wait(lambda: browser.execute_script(ready))
 
@@ -52,6 +52,17 @@ def opened(browser: Chrome, hostile: Report) -> Chrome:
 def rows(browser: Chrome) -> list[str]:
     script = "return [...document.querySelectorAll('td.id')].map(cell => cell.textContent)"
     return list(browser.execute_script(script))
+
+
+def drawn(browser: Chrome) -> Callable[[], bytes]:
+    """Wait until the 3D view shows something; return what takes a picture of it."""
+    canvas = browser.find_element("id", "canvas")
+
+    def pixels() -> bytes:
+        return bytes(canvas.screenshot_as_png)
+
+    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    return pixels
 
 
 def click(browser: Chrome, selector: str) -> None:
@@ -115,12 +126,7 @@ def test_it_opens_an_asset_that_turns(opened):
     opened.switch_to.active_element.send_keys(Keys.ENTER)
     title = opened.find_element("id", "asset-title")
     assert title.text.startswith("bear.front")
-    canvas = opened.find_element("id", "canvas")
-
-    def pixels() -> bytes:
-        return bytes(canvas.screenshot_as_png)
-
-    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    canvas, pixels = opened.find_element("id", "canvas"), drawn(opened)
     front = pixels()
     assert opened.find_element("id", "scale").text.split() == ["jelly", "metal"]
     canvas.send_keys(Keys.ARROW_RIGHT * 4)
@@ -147,13 +153,7 @@ def test_it_opens_an_asset_that_turns(opened):
 
 def test_an_address_may_name_an_asset_in_short(browser, hostile):
     def opened_by(name: str) -> str:
-        browser.get("about:blank")
-        browser.get(f"{hostile.path.as_uri()}#asset={name}")
-        wait(
-            lambda: browser.execute_script(
-                "return performance.getEntriesByName('slatprep-ready').length"
-            )
-        )
+        open_page(browser, hostile, f"#asset={name}")
         shown = browser.execute_script("return document.getElementById('asset').open")
         return browser.current_url.partition("#asset=")[2] if shown else ""
 
@@ -174,13 +174,7 @@ def test_an_address_opens_an_asset_before_the_page_has_been_read(browser, hostil
     slow.write_text(text.replace(LIBRARY, f"{filler}{LIBRARY}"), "utf-8")
     browser.get("about:blank")
     browser.get(f"{slow.as_uri()}#asset=ant")
-    canvas = browser.find_element("id", "canvas")
-
-    def colours() -> int:
-        image = Image.open(io.BytesIO(canvas.screenshot_as_png)).convert("P")
-        return len(image.getcolors() or ())
-
-    wait(lambda: colours() > 8)
+    drawn(browser)
     assert browser.find_element("id", "message").text == ""
     assert_quiet(browser)
 
@@ -214,12 +208,7 @@ def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
     )
     assert rows(browser) == ["bent"]
     click(browser, "tbody tr:not(.space)")
-    canvas = browser.find_element("id", "canvas")
-
-    def pixels() -> bytes:
-        return bytes(canvas.screenshot_as_png)
-
-    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    pixels = drawn(browser)
     click(browser, "[data-switch=field]")
     click(browser, "[data-switch=slat]")
     after = pixels()
@@ -247,12 +236,7 @@ def test_tied_placements_are_stepped_through(browser, mixed_build, tmp_path):
     write_report(open_store(store), path, manifests=mixed_build.records.parent)
     browser.get("about:blank")
     browser.get(f"{path.as_uri()}#asset=cup")
-    canvas = browser.find_element("id", "canvas")
-
-    def pixels() -> bytes:
-        return bytes(canvas.screenshot_as_png)
-
-    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    pixels = drawn(browser)
     assert browser.find_element("id", "ties").text.split("\n")[1:] == ["as taken", "tie 1"]
     click(browser, "#ties button:nth-of-type(1)")
     click(browser, "[data-switch=slat]")

@@ -1,4 +1,4 @@
-"""A build's pass that compares labels with latents, which carry material or nothing."""
+"""The passes over a whole dataset: the consensus, and the witness of telling latents."""
 
 import shutil
 from dataclasses import replace
@@ -11,13 +11,111 @@ from support.trees import records_beside, tree
 
 from slatprep.demo import make_demo
 from slatprep.inspect.check import check_alignment
+from slatprep.inspect.score import score_against_truth
 from slatprep.inspect.verify import verify_store
+from slatprep.judge import THRESHOLDS
 from slatprep.parameters import BuildParameters, ConsensusParameters, WitnessParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.store import open_store
 
+SETTLED = ConsensusParameters(settle=True)
 HEARD = WitnessParameters(settle=True)
+
+
+def copied(store: Path, to: Path) -> Path:
+    """Copy a store and its records: what is built on it need not be aligned again."""
+    shutil.copytree(store.with_suffix(".manifests"), to.with_suffix(".manifests"))
+    return Path(shutil.copytree(store, to))
+
+
+def assert_same_labels(stores: tuple[Path, Path], row: int) -> None:
+    """Hold what one asset was given in one store against what it has in the other."""
+    groups = [zarr.open_group(store, mode="r") for store in stores]
+    first, last = groups[0]["asset/offset"][row : row + 2]
+    for name in ("properties", "material", "valid", "distance", "confidence", "place"):
+        ours, theirs = (group[f"voxel/{name}"][first:last] for group in groups)
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.fixture(scope="module")
+def habitual(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BuildParameters]:
+    """Make fourteen assets, one a category, that all have one quarter turn in common."""
+    root = tmp_path_factory.mktemp("habitual")
+    make_demo(root, assets=14, seed=5, levels=(0,), habitual_share=1.0)
+    return root, load_parameters(root / "dataset.toml", {})
+
+
+@pytest.fixture(scope="module")
+def agreed(habitual: tuple[Path, BuildParameters]) -> tuple[Path, Path]:
+    root, parameters = habitual
+    alone, together = root / "alone.zarr", root / "together.zarr"
+    build_store(parameters, alone)
+    build_store(replace(parameters, consensus=SETTLED), copied(alone, together))
+    return alone, together
+
+
+def test_more_symmetric_assets_are_placed_right_and_no_other_changes(habitual, agreed):
+    truth = habitual[0] / "truth"
+    before, after = (score_against_truth(store, truth).assets for store in agreed)
+    symmetric = [k for k, score in enumerate(before) if score.symmetric]
+    right = [sum(scores[k].displacement < 1.5 for k in symmetric) for scores in (before, after)]
+    assert len(symmetric) >= 2
+    assert right[1] == len(symmetric)
+    assert right[0] < right[1]
+    accuracy = [
+        np.mean([scores[k].label_accuracy for k in symmetric]) for scores in (before, after)
+    ]
+    assert accuracy[1] >= accuracy[0]
+
+    alone, together = map(records_beside, agreed)
+    for row, asset_id in enumerate(alone):
+        if not alone[asset_id]["alignment"]["placements"]:
+            assert together[asset_id]["alignment"] == alone[asset_id]["alignment"]
+            assert_same_labels(agreed, row)
+
+
+def test_what_was_settled_is_recorded_and_can_be_undone(agreed):
+    alone, together = map(records_beside, agreed)
+    settled = [k for k, record in together.items() if record["alignment"]["settled_by"]]
+    assert settled
+    for asset_id in settled:
+        entry = together[asset_id]["alignment"]
+        assert entry["settled_by"]["agreeing"] >= 5
+        assert 0 < entry["settled_by"]["probability"] < 1
+        if entry["transform"] == alone[asset_id]["alignment"]["transform"]:
+            continue
+        assert entry["placements"][0]["transform"] == alone[asset_id]["alignment"]["transform"]
+        assert together[asset_id]["first_pass"]["alignment"] == alone[asset_id]["alignment"]
+    assert not any(record["alignment"]["settled_by"] for record in alone.values())
+
+
+def test_the_store_alone_gives_the_verdicts_on_ties(agreed):
+    for path in agreed:
+        store = open_store(path)
+        assert (store.column("ambiguity") > THRESHOLDS.good_ambiguity).any()
+        for asset_id, given in zip(store.ids, store.column("verdict"), strict=True):
+            check = check_alignment(store, asset_id)
+            assert check.consistent and check.verdict == given
+
+
+def test_building_without_it_brings_the_first_placements_back(habitual, agreed, tmp_path):
+    _, parameters = habitual
+    with_it = replace(parameters, consensus=SETTLED)
+    store = tmp_path / "store.zarr"
+    build_store(with_it, store, jobs=2)
+    assert tree(store) == tree(agreed[1])  # whatever the jobs, and what was there
+    plan = plan_build(parameters, store)
+    assert {asset.action for asset in plan.assets} == {"reuse"}  # no asset is aligned again
+    build_store(parameters, store)
+    assert tree(store) == tree(agreed[0])
+
+
+def test_a_settled_store_that_is_built_again_is_found_unchanged(habitual, agreed):
+    with_it = replace(habitual[1], consensus=SETTLED)
+    times = {path: path.stat().st_mtime_ns for path in agreed[1].rglob("*")}
+    build_store(with_it, agreed[1])
+    assert {path: path.stat().st_mtime_ns for path in agreed[1].rglob("*")} == times
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +144,6 @@ def stores(telling: tuple[Path, BuildParameters]) -> tuple[Path, Path]:
     build_store(replace(parameters, witness=HEARD), heard, note=told.append)
     (root / "told").write_text(told[-1])
     return alone, heard
-
-
-def copied(store: Path, to: Path) -> Path:
-    """Copy a store and its records: what is built on it need not be aligned again."""
-    shutil.copytree(store.with_suffix(".manifests"), to.with_suffix(".manifests"))
-    return Path(shutil.copytree(store, to))
 
 
 def right_labels(root: Path, store: Path) -> dict[str, float]:
@@ -102,14 +194,10 @@ def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(te
     assert heard[wrong]["judgement"]["verdict"] != "good"
     assert "latents contradict" in heard[wrong]["judgement"]["reasons"][0]
     assert heard[wrong]["alignment"] == alone[wrong]["alignment"]
-    groups = [zarr.open_group(store, mode="r") for store in stores]
     for row, asset_id in enumerate(alone):
         if heard[asset_id]["first_pass"] is None:
             assert heard[asset_id] == alone[asset_id]
-            first, last = groups[0]["asset/offset"][row : row + 2]
-            for name in ("properties", "material", "valid", "confidence", "place"):
-                ours, theirs = (group[f"voxel/{name}"][first:last] for group in groups)
-                np.testing.assert_array_equal(ours, theirs)
+            assert_same_labels(stores, row)
 
 
 def test_the_summary_names_assets_whose_labels_are_contradicted(telling, stores):
@@ -127,7 +215,7 @@ def test_a_store_that_heard_latents_is_sound(stores):
 
 def test_it_is_undone_by_building_without_it_and_the_same_for_any_jobs(telling, stores, tmp_path):
     _, parameters = telling
-    store = tmp_path / "store.zarr"
+    store = copied(stores[0], tmp_path / "store.zarr")
     build_store(replace(parameters, witness=HEARD), store, jobs=2)
     assert tree(store) == tree(stores[1])
     plan = plan_build(parameters, store)
@@ -139,7 +227,7 @@ def test_it_is_undone_by_building_without_it_and_the_same_for_any_jobs(telling, 
 def test_with_a_consensus_before_it_the_record_goes_back_to_the_first_pass(
     telling, stores, tmp_path
 ):
-    both = replace(telling[1], witness=HEARD, consensus=ConsensusParameters(settle=True))
+    both = replace(telling[1], witness=HEARD, consensus=SETTLED)
     store = copied(stores[0], tmp_path / "store.zarr")
     build_store(both, store)
     alone = records_beside(stores[0])
@@ -149,16 +237,12 @@ def test_with_a_consensus_before_it_the_record_goes_back_to_the_first_pass(
             assert record["first_pass"]["key"] == alone[asset_id]["key"]
 
 
-def test_latents_that_carry_nothing_change_nothing(tmp_path):
-    make_demo(tmp_path, assets=28, seed=3, levels=(0,), latents="placeholder")
-    parameters = load_parameters(tmp_path / "dataset.toml", {})
-    alone, heard = tmp_path / "alone.zarr", tmp_path / "heard.zarr"
-    build_store(parameters, alone)
+def test_latents_that_carry_nothing_change_nothing(habitual, agreed, tmp_path):
     told: list[str] = []
-    copied(alone, heard)
-    summary = build_store(replace(parameters, witness=HEARD), heard, note=told.append)
-    assert summary.contradicted == () and told[-1].endswith("latents are not used")
+    heard = copied(agreed[0], tmp_path / "heard.zarr")
+    summary = build_store(replace(habitual[1], witness=HEARD), heard, note=told.append)
+    assert summary.contradicted == ()
+    assert "fit their own labels best; too few, so latents are not used" in told[-1]
     assert all(record["first_pass"] is None for record in records_beside(heard).values())
-    before, after = (zarr.open_group(store, mode="r") for store in (alone, heard))
-    for name, array in before["voxel"].arrays():
-        np.testing.assert_array_equal(array[:], after[f"voxel/{name}"][:])
+    for row in range(len(open_store(heard))):
+        assert_same_labels((agreed[0], heard), row)
