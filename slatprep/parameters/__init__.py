@@ -41,9 +41,14 @@ class _Group:
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 
+    def __post_init__(self) -> None:
+        for name in ("root", "map", "categories"):
+            if isinstance(text := getattr(self, name, None), str):
+                object.__setattr__(self, name, place_of(text))
 
-PlaceText = Annotated[Place, InJson({"type": "str"}, place_of)]
-"""A place, which is a text in files."""
+
+PlaceText = Annotated[Place, InJson({"type": "str"})]
+"""A place, which may be given as a text."""
 
 Samples = Literal["one", "first", "all", "merge"]
 """The treatment of several annotations of an object, see `PixieverseSource`."""
@@ -82,6 +87,7 @@ class PixieverseSource(_Group):
     plausibility: Plausibility = "refuse"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.sample and self.samples != "one":
             raise ValueError("samples = 'one' where `sample` names the one to take")
 
