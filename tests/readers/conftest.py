@@ -1,11 +1,12 @@
 """Small sources whose content is written down by hand."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.raw_sources import COORDS, FEATS, raw_grid, touch
+from support.raw_sources import COORDS, FEATS, pair_of, raw_grid, touch
 
 from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover
@@ -32,16 +33,11 @@ def make_pair(tmp_path: Path) -> Callable[..., AssetPair]:
             np.savez(folder / "bounds.npz", **bounds)
         (tmp_path / "slat").mkdir(exist_ok=True)
         np.savez(tmp_path / "slat" / "a.npz", coords=coords, feats=feats)
-        return AssetPair(
-            asset_id="a",
-            object_id="a",
-            view="",
-            category="",
+        return replace(
+            pair_of(folder, tmp_path / "slat" / "a.npz"),
             roots=SourceRoots(tmp_path / "pixieverse", tmp_path / "slat"),
-            grid=folder / "grid.npy",
             mask=None if mask is None else folder / "mask.npy",
             bounds=None if bounds is None else folder / "bounds.npz",
-            slat=tmp_path / "slat" / "a.npz",
         )
 
     return make

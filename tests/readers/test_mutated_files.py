@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.raw_sources import COORDS, FEATS, npy, raw_grid
+from support.raw_sources import COORDS, FEATS, npy, pair_of, raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field, read_latents
-from slatprep.records import AssetPair, SourceRoots
+from slatprep.records import AssetPair
 
 SETTINGS = settings(max_examples=150, derandomize=True, database=None)
 
@@ -70,21 +70,7 @@ MASK = npy(raw_grid()[..., 3] != 7)
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], AssetPair]:
     root: Path = tmp_path_factory.mktemp("mutated")
-
-    def make(slat: str) -> AssetPair:
-        return AssetPair(
-            asset_id="a",
-            object_id="a",
-            view="",
-            category="",
-            roots=SourceRoots(root, root),
-            grid=root / "grid.npy",
-            mask=root / "mask.npy",
-            bounds=None,
-            slat=root / slat,
-        )
-
-    return make
+    return lambda slat: pair_of(root, root / slat)
 
 
 def read_latents_or_refuse(pair: AssetPair) -> bool:

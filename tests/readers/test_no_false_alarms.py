@@ -35,7 +35,7 @@ def alarms(folder: Path, assets: int, seed: int, **options: Any) -> list[str]:
 
 @pytest.mark.parametrize("source", get_args(Source))
 def test_sources_of_the_demo_raise_no_alarm(tmp_path, source):
-    assert alarms(tmp_path / "demo", 6, 3, source=source) == []
+    assert alarms(tmp_path / "demo", 3, 3, source=source) == []
 
 
 def test_every_category_in_samples_that_err_raises_no_alarm(tmp_path):

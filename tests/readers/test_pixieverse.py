@@ -242,18 +242,6 @@ BAD_GRIDS = {
 }
 
 
-@pytest.mark.parametrize("fault", BAD_GRIDS)
-def test_bad_grid(make_pair, fault):
-    grid, what, expected = BAD_GRIDS[fault]
-    pair = make_pair(grid=grid)
-    with pytest.raises(InputError) as caught:
-        read_field(pair)
-    assert caught.value.path == str(pair.grid)
-    assert what in caught.value.fault
-    assert expected in caught.value.expected
-    assert "\n" not in str(caught.value)
-
-
 UNPHYSICAL = {
     "Poisson's ratio above 0.5": (2, 0.546, "Poisson's ratio 0.546", "[0, 0.5]"),
     "negative Poisson's ratio": (2, -0.01, "Poisson's ratio -0.01", "[0, 0.5]"),
@@ -312,9 +300,10 @@ def test_an_asset_fails_by_the_share_of_its_unphysical_voxels(make_pair):
         read_field(make_pair(grid=grid), 1.0)
 
 
-def test_values_of_a_voxel_without_class_do_not_matter(make_pair):
+@pytest.mark.parametrize("material", [-1, 7], ids=["without class", "outside the object"])
+def test_values_of_a_voxel_that_is_not_annotated_do_not_matter(make_pair, material):
     grid = raw_grid()
-    grid[30, 30, 30] = np.nan, -1, 9, -1
+    grid[30, 30, 30] = np.nan, -1, 9, material
     read = read_field(make_pair(grid=grid))
     assert read.voxels.tolist() == VOXELS
     assert read.unphysical == 0
@@ -336,15 +325,18 @@ BAD_MASKS = {
 }
 
 
-@pytest.mark.parametrize("fault", BAD_MASKS)
-def test_bad_mask(make_pair, fault):
-    mask, what, expected = BAD_MASKS[fault]
-    pair = make_pair(mask=mask)
+@pytest.mark.parametrize(
+    ("kind", "fault"), [*(("grid", k) for k in BAD_GRIDS), *(("mask", k) for k in BAD_MASKS)]
+)
+def test_a_bad_grid_or_mask_is_named(make_pair, kind, fault):
+    array, what, expected = (BAD_GRIDS if kind == "grid" else BAD_MASKS)[fault]
+    pair = make_pair(**{kind: array})
     with pytest.raises(InputError) as caught:
         read_field(pair)
-    assert caught.value.path == str(pair.mask)
+    assert caught.value.path == str(getattr(pair, kind))
     assert what in caught.value.fault
     assert expected in caught.value.expected
+    assert "\n" not in str(caught.value)
 
 
 def test_mask_beside_the_object_leaves_nothing_annotated(make_pair):
@@ -352,9 +344,3 @@ def test_mask_beside_the_object_leaves_nothing_annotated(make_pair):
     mask[30, 30, 30] = True
     with pytest.raises(InputError, match="none of the 1 occupied voxels is annotated"):
         read_field(make_pair(mask=mask))
-
-
-def test_values_outside_the_object_do_not_matter(make_pair):
-    grid = raw_grid()
-    grid[30, 30, 30, :3] = np.nan, -1, 9
-    assert read_field(make_pair(grid=grid)).voxels.tolist() == VOXELS

@@ -11,7 +11,7 @@ from slatprep.demo.materials import MATERIALS
 from slatprep.errors import InputError
 from slatprep.readers import read_field
 from slatprep.readers.identity import hash_sources
-from slatprep.records import MATERIAL_CLASSES, Units
+from slatprep.records import Units
 
 JELLY, METAL, SAND, VISPLAS, FLUID, SNOW, STATIONARY = range(7)
 
@@ -220,9 +220,3 @@ def test_units_and_the_setting_are_part_of_what_an_asset_is_made_from(make_pair)
     warn = replace(pair, roots=replace(pair.roots, plausibility="warn"))
     digests = [before, hash_sources(units)[1], hash_sources(warn)[1]]
     assert len({json.dumps(one, sort_keys=True) for one in digests}) == 3
-
-
-def test_classes_of_the_table_are_those_of_the_records():
-    assert MATERIAL_CLASSES[:7] == (
-        "jelly", "metal", "sand", "visplas", "fluid", "snow", "stationary"
-    )  # fmt: skip

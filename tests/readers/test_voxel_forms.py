@@ -3,8 +3,11 @@
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numcodecs
 import numpy as np
 import pytest
 import zarr
@@ -153,53 +156,40 @@ def test_a_class_that_the_table_does_not_have_is_refused(root):
             field_at(root)
 
 
-def damaged(root: Path, how: str) -> None:
-    rows = rows_of(3000)
-    write_voxels(root, "a", "zarr", rows)
-    group = root / "a.zarr"
-    about = group / "density" / "zarr.json"
-    if how == "missing":
-        shutil.rmtree(group / "density")
-    elif how == "shards":
-        shutil.rmtree(group / "density")
-        opened = zarr.open_group(group, mode="a")
-        opened.create_array("density", data=rows["density"], chunks=(500,), shards=(3000,))
-    elif how == "version 2":
-        shutil.rmtree(group / "density")
-        zarr.save_array(group / "density", rows["density"], zarr_format=2)
-    elif how == "codec":
-        text = about.read_text().replace('"zstd"', '"numcodecs.pickle"')
-        about.write_text(text)
-    elif how == "rows":
-        metadata = json.loads(about.read_text())
-        metadata["shape"] = [2**40]
-        about.write_text(json.dumps(metadata))
-    elif how == "metadata":
-        about.write_text(about.read_text() + " " * 2**16)
-    elif how == "bomb":
-        import numcodecs
-
-        chunk = next((group / "density" / "c").rglob("0"))
-        chunk.write_bytes(numcodecs.Zstd().encode(bytes(2**24)))
-    else:
-        (group / "density" / "c" / "0").write_bytes(b"torn")
+def edit(change: Callable[[str], str]) -> Callable[[Path], object]:
+    """Return what changes the text of the metadata of an array."""
+    return lambda array: (array / "zarr.json").write_text(change((array / "zarr.json").read_text()))
 
 
-@pytest.mark.parametrize(
-    ("how", "said"),
-    [
-        ("missing", "is not in it"),
-        ("shards", "sharding_indexed"),
-        ("version 2", "is not in it"),
-        ("codec", "numcodecs.pickle"),
-        ("rows", "N <= 2097152"),
-        ("metadata", r"zarr\.json has 6\d{4} bytes"),
-        ("bomb", "it holds 16777216 bytes"),
-        ("torn", "cannot be unpacked|it holds"),
-    ],
-)
-def test_zarr_that_cannot_be_read_is_said(root, how, said):
-    damaged(root, how)
+def chunk_of(array: Path, content: bytes) -> None:
+    (array / "c" / "0").write_bytes(content)
+
+
+def written_anew(array: Path, **how: Any) -> None:
+    values = rows_of(3000)[array.name]
+    shutil.rmtree(array)
+    zarr.create_array(array, data=values, **how)
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (shutil.rmtree, "is not in it"),
+    "shards": (lambda a: written_anew(a, chunks=(500,), shards=(3000,)), "sharding_indexed"),
+    "version 2": (lambda a: written_anew(a, zarr_format=2), "is not in it"),
+    "codec": (edit(lambda t: t.replace('"zstd"', '"numcodecs.pickle"')), "numcodecs.pickle"),
+    "rows": (edit(lambda t: json.dumps(json.loads(t) | {"shape": [2**40]})), "N <= 2097152"),
+    "metadata": (edit(lambda t: t + " " * 2**16), r"zarr\.json has 6\d{4} bytes"),
+    "bomb": (
+        lambda a: chunk_of(a, numcodecs.Zstd().encode(bytes(2**24))), "it holds 16777216 bytes"
+    ),
+    "torn": (lambda a: chunk_of(a, b"torn"), "cannot be unpacked|it holds"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_zarr_that_cannot_be_read_is_said(root, how):
+    write_voxels(root, "a", "zarr", rows_of(3000))
+    damage, said = DAMAGES[how]
+    damage(root / "a.zarr" / "density")
     with pytest.raises(InputError, match=rf"a\.zarr \[density\].*({said})"):
         field_at(root)
 

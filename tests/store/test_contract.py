@@ -32,13 +32,11 @@ def by_hand(stuff: tuple[float, ...]) -> list[float]:
     return values
 
 
-def test_ids_and_what_belongs_to_them(root):
+def test_ids_offsets_and_voxels_are_the_source_files(root, mixed):
     assert [str(i) for i in root["asset/id"][:]] == IDS
     assert [str(i) for i in root["asset/object_id"][:]] == ["ant", "bear", "bear", "cup", "dog"]
     assert [str(i) for i in root["asset/view"][:]] == ["", "front", "side", "", ""]
 
-
-def test_offsets_and_voxels_are_the_source_files(root, mixed):
     offset = root["asset/offset"][:]
     assert offset.dtype == np.int64
     assert offset[0] == 0
@@ -106,9 +104,6 @@ def test_arrays_have_the_contracts_types_and_names_of_dimensions(root):
     }
     for name, dtype in dtypes.items():
         assert root[name].dtype == dtype
-    for name, array in root["asset"].arrays():
-        own = (name,)  # a coordinate names itself
-        assert array.metadata.dimension_names[0] in ("asset", "asset_edge", *own)
     assert root["voxel/properties"].metadata.dimension_names == ("voxel", "property")
     assert root["grid/material"].metadata.dimension_names == ("asset", "x", "y", "z")
 

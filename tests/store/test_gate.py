@@ -104,18 +104,6 @@ def test_the_largest_chunks_and_shards_that_may_be_asked_for_are_read(make_datas
     assert verify_store(tmp_path / "large.zarr").ok
 
 
-def test_what_is_built_goes_through_the_gate(store):
-    group = open_store(store).group
-    assert {name for name, _ in group.members(max_depth=None)} >= {
-        "asset/id",
-        "grid/x",
-        "file/name",
-    }
-    document = json.loads((store / "zarr.json").read_text())
-    for name, metadata in document["consolidated_metadata"]["metadata"].items():
-        assert not list(gate_findings(name, metadata))
-
-
 META = "consolidated_metadata"
 EDITS: dict[str, tuple[dict[str, Any], str]] = {
     "gzip": ({"codecs": [{"name": "bytes"}, {"name": "gzip"}]}, "has the codec 'gzip'"),

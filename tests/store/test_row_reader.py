@@ -125,6 +125,11 @@ def test_a_column_of_fill_values_alone_needs_no_file(tmp_path, shard):
     for name in ("asset/offset", "voxel/valid"):
         with pytest.raises(StoreError, match=f"{name}/c/0: is missing"):
             reader_of(tmp_path, name).read(0, 2)
+    with pytest.raises(StoreError, match="do not follow one another"):
+        list(reader_of(tmp_path, "asset/category").packed(0, 1))
+    folder = WatchedFolder(tmp_path)
+    assert reader_of(folder, "asset/category").read(0, 9).tolist() == [""] * 9
+    assert folder.asked == []
 
 
 EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
@@ -289,15 +294,6 @@ def test_chunks_that_lie_side_by_side_are_asked_for_at_once(tmp_path):
     assert asked(28, 36) == []
 
 
-def test_a_column_without_a_file_has_nothing_to_fetch(tmp_path):
-    make(tmp_path, "asset/category", np.array([""] * 9, object), 3, 9, "")
-    make(tmp_path, "asset/view", np.array([""] * 9, object), 3, None, "")
-    folder = WatchedFolder(tmp_path)
-    for name in ("asset/category", "asset/view"):
-        assert reader_of(folder, name).read(0, 9).tolist() == [""] * 9
-    assert folder.asked == []
-
-
 def test_the_shards_read_last_stay_open_and_no_others(tmp_path):
     values = np.arange(1, OPEN_SHARDS + 9, dtype=np.uint8)
     make(tmp_path, "voxel/material", values, 1, 1)
@@ -314,19 +310,19 @@ def test_the_shards_read_last_stay_open_and_no_others(tmp_path):
     assert len(folder.files) == opened + 1
 
 
-class Failing(LocalFile):
-    """A disk that fails behind the index, which was read before."""
-
-    def pread(self, length: int, offset: int) -> bytes:
-        if offset < self.size() - 68:
-            raise OSError(errno.EIO, "the disk gave up")
-        return super().pread(length, offset)
-
-    prefetch = pread  # type: ignore[assignment]
-
-
+@pytest.mark.parametrize("index_bytes", [0, 68], ids=["with the index", "behind the index"])
 @pytest.mark.parametrize("prefetch_bytes", [0, 2**20])
-def test_a_chunk_that_cannot_be_read_names_its_file(shard, tmp_path, prefetch_bytes):
+def test_what_cannot_be_read_names_its_file(shard, tmp_path, prefetch_bytes, index_bytes):
+    class Failing(LocalFile):
+        """A disk, or a server that cuts a body short: size answers, reading does not."""
+
+        def pread(self, length: int, offset: int) -> bytes:
+            if offset < self.size() - index_bytes:
+                raise OSError(errno.EIO, "the disk gave up")
+            return super().pread(length, offset)
+
+        prefetch = pread  # type: ignore[assignment]
+
     class Folder(LocalFolder):
         def open(self, name: str) -> LocalFile:
             return Failing(f"{self.path}/{name}")
@@ -384,9 +380,3 @@ def test_packed_chunks_that_are_not_side_by_side_or_damaged_are_refused(tmp_path
         assert sum(lengths == [n for _, n in index[:2]] for _, lengths in reader.packed(0, 2)) == 1
         with pytest.raises(StoreError, match="c/0: a chunk is damaged"):
             list(reader.packed(0, 4))
-
-
-def test_a_column_without_a_file_has_no_packed_chunks(tmp_path):
-    make(tmp_path, "asset/category", np.array([""] * 9, object), 3, 9, "")
-    with pytest.raises(StoreError, match="do not follow one another"):
-        list(reader_of(LocalFolder(tmp_path), "asset/category").packed(0, 1))

@@ -1,6 +1,5 @@
 """Rows read straight from shards, against zarr-python, from threads and processes, and hostile."""
 
-import errno
 import json
 import multiprocessing
 import os
@@ -13,38 +12,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import zarr
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.storage.files import LocalFile, LocalFolder
 from slatprep.store import Store, open_store
-from slatprep.store.contract import read_metadata
 from slatprep.store.layout import ARRAYS
-from slatprep.store.shard_reader import RowReader
 
 
 @pytest.fixture(scope="module")
 def store(mixed_build: BuildSummary) -> Store:
     return open_store(mixed_build.store)
-
-
-@settings(max_examples=60, derandomize=True, database=None)
-@given(data=st.data())
-def test_any_rows_are_those_that_zarr_reads(store, data):
-    name = data.draw(st.sampled_from([layout.name for layout in ARRAYS]))
-    rows = store.shape(name)[0]
-    start = data.draw(st.integers(0, rows))
-    stop = data.draw(st.integers(start, min(rows, start + 700)))
-    if name.startswith("grid/"):
-        stop = min(stop, start + 2)
-    ours, theirs = store.read_rows(name, start, stop), store.group[name][start:stop]
-    if theirs.dtype.kind in "TO":
-        assert ours.tolist() == theirs.tolist()
-    else:
-        assert ours.dtype == theirs.dtype
-        assert ours.tobytes() == np.ascontiguousarray(theirs).tobytes()
 
 
 def digest(store: Store, index: int) -> list[bytes]:
@@ -216,20 +193,3 @@ def test_a_shard_that_is_a_pipe_or_a_folder_does_not_hang(copy):
     os.mkfifo(shard)
     with pytest.raises(StoreError, match="no regular file"):
         open_store(copy).read(0)
-
-
-def test_an_index_that_cannot_be_read_names_its_file(copy):
-    """As an object store that cuts a body short makes it: size answers, reading does not."""
-
-    class Cut(LocalFile):
-        def pread(self, length: int, offset: int) -> bytes:
-            raise OSError(errno.EIO, "the body was cut")
-
-    class Folder(LocalFolder):
-        def open(self, name: str) -> LocalFile:
-            return Cut(f"{self.path}/{name}")
-
-    metadata = read_metadata(copy / "voxel/feats/zarr.json")
-    reader = RowReader.of(Folder(copy), "voxel/feats", metadata)
-    with pytest.raises(StoreError, match=r"voxel/feats/c/0/0: cannot be read \(the body was cut\)"):
-        reader.read(0, 1)

@@ -7,7 +7,7 @@ import numpy as np
 
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_field
-from slatprep.records import MaterialField, Units
+from slatprep.records import AssetPair, MaterialField, SourceRoots, Units
 
 COORDS = np.array([[0, 0, 0], [63, 1, 2], [5, 63, 63]], dtype=np.uint8)
 FEATS = np.arange(24, dtype=np.float32).reshape(3, 8) / 8 - 1
@@ -34,6 +34,12 @@ def touch(root: Path, *names: str) -> None:
 
 def grid(name: str) -> str:
     return f"{name}/sample_0/material_grid.npy"
+
+
+def pair_of(folder: Path, slat: Path) -> AssetPair:
+    """Return the pair of a grid and a mask of a folder, which is the root, and a SLAT."""
+    roots = SourceRoots(folder, slat.parent)
+    return AssetPair("a", "a", "", "", roots, folder / "grid.npy", folder / "mask.npy", None, slat)
 
 
 def npy(array: np.ndarray) -> bytes:
