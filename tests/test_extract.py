@@ -5,6 +5,7 @@ so that order and number of the calls matter as they do with the real one.
 """
 
 import contextlib
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -122,7 +123,7 @@ def run(session: work.Session, images: list[Path], out: Path, *seeds: int) -> li
     return list(work.extract(session, work.list_extractions(images, out, list(seeds), False)))
 
 
-def test_latents_are_what_the_pipeline_returns(session, images, tmp_path):
+def test_latents_and_their_record_are_what_the_pipeline_returns(session, images, tmp_path):
     [result] = run(session, images[:1], tmp_path / "slat", 7)
     with np.load(tmp_path / "slat" / "cup.npz") as saved:
         coords, feats = saved["coords"], saved["feats"]
@@ -137,19 +138,13 @@ def test_latents_are_what_the_pipeline_returns(session, images, tmp_path):
     np.testing.assert_array_equal(coords, slat.coords.numpy())
     np.testing.assert_array_equal(feats, slat.feats.numpy().astype(np.float32))
     assert result.voxels == len(coords) and session.pipeline.seen == ["cropped", (518, 518)]
-
-
-def test_provenance_says_how_to_do_it_again(session, images, tmp_path):
-    import hashlib
-
-    run(session, images[:1], tmp_path / "slat", 7)
+    # And how to do it again.
     record = json.loads((tmp_path / "slat" / "cup.json").read_text("utf-8"))
     assert record["seed"] == 7 and record["model"] == {"name": "m", "revision": "abc"}
-    assert record["image"]["sha256"] == hashlib.sha256(images[0].read_bytes()).hexdigest()
     assert record["slat_normalization"] == {"mean": MEAN, "std": STD}
     assert record["sparse_structure_sampler_params"]["cfg_strength"] == 7.5
-    slat = (tmp_path / "slat" / "cup.npz").read_bytes()
-    assert record["slat"]["sha256"] == hashlib.sha256(slat).hexdigest()
+    for key, file in (("image", images[0]), ("slat", tmp_path / "slat" / "cup.npz")):
+        assert record[key]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def test_build_store_reads_what_is_extracted(session, images, tmp_path):

@@ -6,7 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -106,46 +107,23 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(
 @pytest.mark.parametrize(("kind", "side"), [("512", 32), ("1024", 64)])
 def test_trellis2_is_called_in_the_order_of_its_run(kind, side, images, torch):
     """As `Trellis2ImageTo3DPipeline.run`: preprocess, seed, conditions, voxels, shape latents."""
-    calls: list[Any] = []
-    coords = Tensor(np.zeros((5, 4), np.int64))
-    monkey = torch.manual_seed
-    torch.manual_seed = lambda seed: (calls.append(("seed", seed)), monkey(seed))
-
-    class Pipeline2:
-        device = "cpu"
-        models: ClassVar = {
-            "shape_slat_flow_model_512": "f512",
-            "shape_slat_flow_model_1024": "f1024",
-        }
-
-        def preprocess_image(self, image: Any) -> Any:
-            calls.append("preprocess")
-            return image
-
-        def get_cond(self, image: list[Any], resolution: int) -> int:
-            calls.append(("cond", resolution))
-            return resolution
-
-        def sample_sparse_structure(self, cond: int, resolution: int, num_samples: int) -> Any:
-            calls.append(("structure", cond, resolution, num_samples))
-            return coords
-
-        def sample_shape_slat(self, cond: int, model: str, there: Any) -> Any:
-            calls.append(("shape", cond, model))
-            assert there is coords
-            return SimpleNamespace(coords=coords, feats=Tensor(np.ones((5, 32))))
-
-    image = Image.open(images[0])
-    found, feats, seconds = trellis_latents.sample_trellis2(
-        Pipeline2(), torch, image, 3, True, kind
+    coords, image = Tensor(np.zeros((5, 4), np.int64)), Image.open(images[0])
+    flows = {f"shape_slat_flow_model_{name}": f"f{name}" for name in ("512", "1024")}
+    run = Mock(device="cpu", models=flows)
+    run.preprocess_image.side_effect = lambda image: image
+    run.get_cond.side_effect = lambda image, resolution: resolution
+    run.sample_sparse_structure.return_value = coords
+    run.sample_shape_slat.return_value = SimpleNamespace(
+        coords=coords, feats=Tensor(np.ones((5, 32)))
     )
-    conditions = [("cond", 512)] + ([("cond", 1024)] if kind == "1024" else [])
-    assert calls == [
-        "preprocess",
-        ("seed", 3),
-        *conditions,
-        ("structure", 512, side, 1),
-        ("shape", int(kind), f"f{kind}"),
+    torch.manual_seed = run.seed
+    found, feats, seconds = trellis_latents.sample_trellis2(run, torch, image, 3, True, kind)
+    assert run.mock_calls == [
+        call.preprocess_image(image),
+        call.seed(3),
+        *(call.get_cond([image], side) for side in ((512, 1024) if kind == "1024" else (512,))),
+        call.sample_sparse_structure(512, side, 1),
+        call.sample_shape_slat(int(kind), f"f{kind}", coords),
     ]
     assert found.dtype == np.int32 and feats.shape == (5, 32) and feats.dtype == np.float32
     assert set(seconds) == set(trellis_latents.STAGES)

@@ -1,12 +1,10 @@
 """The benchmark of reading reads the same by every way."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import reading as read
-from click.testing import CliRunner
 
 from slatprep.errors import StoreError
 from slatprep.store import open_store
@@ -35,12 +33,3 @@ def test_a_way_that_reads_something_else_is_not_measured(mixed_build, tmp_path, 
     monkeypatch.setattr(read, "WAYS", (read.Way("npz", others, "npz"),))
     with pytest.raises(StoreError, match=r"npz reads other coords of asset \d+ than slatprep does"):
         read.bench_read(mixed_build.store, tmp_path, repeats=1)
-
-
-def test_the_command_gives_a_figure_for_every_way(mixed_build):
-    call = [str(mixed_build.store), "--assets", "2", "--repeats", "1", "--json"]
-    result = CliRunner().invoke(read.main, [*call, "-q"], catch_exceptions=False)
-    ways = {way["name"]: way for way in json.loads(result.stdout)["ways"]}
-    assert set(ways) >= {"slatprep", "npz", "npz compressed", "one HDF5 file", "zarr-python"}
-    assert all(way["warm"] > 0 and way["warm_two"] > 0 for way in ways.values())
-    assert ways["npz"]["files"] == 2

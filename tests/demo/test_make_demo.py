@@ -52,20 +52,18 @@ def test_layout_is_that_of_the_real_data(demo):
             assert bounds["grid_shape"].tolist() == [64] * 3
         with np.load(root / "slat" / f"{uid}.npz") as slat:
             coords, feats = slat["coords"], slat["feats"]
-        assert coords.dtype == np.uint8
-        assert feats.dtype == np.float32
-        assert coords.shape == (len(coords), 3)
-        assert feats.shape == (len(coords), 8)
         assert len(np.unique(coords, axis=0)) == len(coords) <= 32_768
         assert coords.max() <= 63
         with np.load(root / "truth" / f"{uid}.npz") as truth:
-            assert truth["transform"].shape == (4, 4)
-            assert truth["transform"].dtype == np.float64
+            for array, kind, shape in (
+                (coords, np.uint8, (len(coords), 3)),
+                (feats, np.float32, (len(coords), 8)),
+                (truth["transform"], np.float64, (4, 4)),
+                (truth["material"], np.uint8, (len(coords),)),
+                (truth["properties"], np.float32, (len(coords), 3)),
+            ):
+                assert (array.dtype, array.shape) == (kind, shape)
             assert np.array_equal(truth["transform"], entry["rows"][0]["transform"])
-            assert truth["material"].shape == (len(coords),)
-            assert truth["material"].dtype == np.uint8
-            assert truth["properties"].shape == (len(coords), 3)
-            assert truth["properties"].dtype == np.float32
             assert str(truth["name"]) == entry["name"]
             assert int(truth["level"]) == entry["level"]
             assert bool(truth["symmetric"]) == entry["symmetric"]

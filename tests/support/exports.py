@@ -4,6 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from support.synthetic import JELLY, METAL
+
 
 def index_of(directory: Path) -> list[dict[str, Any]]:
     return json.loads((directory / "index.json").read_text("utf-8"))["assets"]
@@ -14,3 +18,14 @@ def bytes_of(path: Path) -> dict[str, bytes]:
         return {"": path.read_bytes()}
     files = (file for file in path.rglob("*") if file.is_file())
     return {file.relative_to(path).as_posix(): file.read_bytes() for file in files}
+
+
+def hold_truth(
+    material: np.ndarray, modulus: np.ndarray, density: np.ndarray, ratio: np.ndarray
+) -> None:
+    """Hold the values of an asset of `support.synthetic`, by class, to those of its two stuffs."""
+    assert set(np.unique(material)) == {JELLY[0], METAL[0]}
+    for number, *values in (JELLY, METAL):
+        here = material == number
+        for column, value in zip((modulus, density, ratio), values, strict=True):
+            np.testing.assert_allclose(column[here], value, rtol=1e-4)
