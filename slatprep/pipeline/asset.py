@@ -35,11 +35,11 @@ from slatprep.geometry.voxels import occupancy_of, voxels_of
 from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
 from slatprep.pipeline.annotate import annotate, process_several
+from slatprep.pipeline.before import as_read
 from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe, record_of, record_of_failed
 from slatprep.pipeline.rows import Row
-from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import reading_of, source_digests

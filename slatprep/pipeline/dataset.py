@@ -160,7 +160,10 @@ def build_store(
         finished = made if kept else [*made, *finish(unchanged, plan, context, crew)]
         following, failed = settle_rows(finished, kept, before, context, wanted, crew)
         packed = _pack(before, following, work, crew)
-        summary = _publish(before, parameters, begin, following, packed, failed, crew.seen)
+        read: list[PlannedAsset | Row] = list(plan.values())
+        read += [asset for asset in finished if isinstance(asset, Row)]
+        seen = {one.asset_id: one.seen for one in read if one.seen}
+        summary = _publish(before, parameters, begin, following, packed, failed, seen)
         if keep_work:
             work.keep_only({row.key for row in following.rows if row.spooled})
         if packed is not None:
@@ -196,8 +199,6 @@ def finish(
         crew.progress(0, len(pairs))
     for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
         assets.append(asset)
-        if isinstance(asset, Row) and asset.seen:
-            crew.seen[asset.asset_id] = asset.seen
         if crew.progress:
             crew.progress(len(assets), len(pairs))
     return assets

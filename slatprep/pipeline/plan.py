@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from types import MappingProxyType
 
 from slatprep.errors import SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.before import as_read
 from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import Names
-from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers.identity import hash_sources
 from slatprep.records import AssetPair, Place, SourceFile
@@ -45,15 +45,12 @@ class Crew:
         Called with the assets done and the assets in all; at the beginning with none done.
     note : callable or None
         See `Note`.
-    seen : dict of str to bytes
-        States of the sources of assets as they were read, by id.
     """
 
     jobs: Jobs
     assets_per_job: int = 1
     progress: Progress | None = None
     note: Note | None = None
-    seen: dict[str, bytes] = field(default_factory=dict)
 
     def of(self, assets: int) -> Jobs:
         """Return who works on so many assets."""
@@ -178,8 +175,6 @@ def plan_assets(
     tasks = ((pair, context) for pair in other)
     for planned in run_unordered(plan_asset, tasks, crew.of(len(pairs) - len(known))):
         plan.append(planned)
-        if planned.seen:
-            crew.seen[planned.asset_id] = planned.seen
         if crew.progress:
             crew.progress(len(plan), len(pairs))
     gone = context.previous.ids - {pair.asset_id for pair in pairs} if context.previous else ()
@@ -198,14 +193,6 @@ def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
             return PlannedAsset(pair.asset_id, Action.REFUSE, " ".join(str(error).split()))
     planned = _planned(pair, sources, digests, context)
     return replace(planned, seen=as_read(pair, noted))
-
-
-def key_of(pair: AssetPair, recipe: Recipe) -> tuple[str, str]:
-    """Return an asset's id and the key that its sources give; empty if they cannot be read."""
-    try:
-        return pair.asset_id, recipe.key(pair.asset_id, hash_sources(pair)[1])
-    except SlatprepError:
-        return pair.asset_id, ""
 
 
 def _planned(

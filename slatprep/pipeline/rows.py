@@ -95,11 +95,6 @@ class Row:
         """Where its arrays lie, for a task."""
         return self.key if self.spooled else (self.store, self.row, self.names)
 
-    @property
-    def latents(self) -> LatentMoments | None:
-        """Moments of its latents, of a row in the spool."""
-        return moments_of(self.columns["latent_mean"], self.columns["latent_std"])
-
 
 Where = str | tuple[int, int, Names | None]
 """Where a row's arrays lie: its key in the spool, or its store, its row there and its new names."""

@@ -26,8 +26,7 @@ from typing import Any, TypeVar
 from slatprep.errors import ConfigError, SlatprepError, amount
 from slatprep.records import Place
 from slatprep.storage.place import place_of, storage_of
-from slatprep.workers.local import single_threaded
-from slatprep.workers.pool import Pool, run_in_pools
+from slatprep.workers.local import Pool, run_in_pools, single_threaded
 
 try:
     import distributed
@@ -197,7 +196,7 @@ async def _reach(scheduler: str) -> None:
 
 
 class _Pool(Pool):
-    """The workers that a cluster has now, for `slatprep.workers.pool`."""
+    """The workers that a cluster has now, for `slatprep.workers.local`."""
 
     killed = distributed.KilledWorker
 

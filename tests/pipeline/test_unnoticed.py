@@ -17,7 +17,7 @@ from support.first_builds import tree_from_nothing
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
-from slatprep.pipeline import seen
+from slatprep.pipeline import before, plan
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import AssetPair, SourceRoots
 from slatprep.storage import states
@@ -205,12 +205,11 @@ def test_a_share_is_hashed_at_each_build_and_finds_all(unnoticed, tmp_path):
 def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
     tmp_path, monkeypatch, files_are_old
 ):
-    from slatprep.pipeline import plan
-
     dataset, hashed = Dataset(tmp_path / "d").having("a", "b"), list[str]()
     built(dataset, tmp_path)
     real = plan.hash_sources
-    monkeypatch.setattr(plan, "hash_sources", lambda p: hashed.append(p.asset_id) or real(p))
+    for module in (before, plan):
+        monkeypatch.setattr(module, "hash_sources", lambda p: hashed.append(p.asset_id) or real(p))
     built(dataset, tmp_path)
     assert len(hashed) == 1
     built(dataset, tmp_path, rehash=0)
@@ -223,6 +222,6 @@ def test_nothing_is_seen_of_an_asset_whose_reader_reads_what_is_not_known():
     roots = SourceRoots(Path(), Path())
     pair = AssetPair("a", "a", "", "", roots, Path("/g"), None, None, Path("/s"))
     files = {"/s": (1,), "/g": (2,)}
-    assert seen.as_read(pair, files) != bytes(16)
-    assert seen.as_read(pair, {**files, "/mesh": (3,)}) == bytes(16)
-    assert seen.as_read(pair, {**files, "/g": None}) == bytes(16)
+    assert before.as_read(pair, files) != bytes(16)
+    assert before.as_read(pair, {**files, "/mesh": (3,)}) == bytes(16)
+    assert before.as_read(pair, {**files, "/g": None}) == bytes(16)

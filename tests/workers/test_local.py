@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from slatprep.errors import SlatprepError
-from slatprep.workers.local import run_unordered, single_threaded
-from slatprep.workers.pool import Pool, run_in_pools
+from slatprep.workers.local import Pool, run_in_pools, run_unordered, single_threaded
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

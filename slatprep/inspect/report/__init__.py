@@ -15,7 +15,7 @@ from slatprep.inspect.report.drawn import BINS, COARSE, FULL, PER_SHEET, Drawn, 
 from slatprep.inspect.report.outcomes import gather_outcomes
 from slatprep.inspect.report.page import write_page
 from slatprep.inspect.tallies import no_tally
-from slatprep.inspect.verify.index import WORDS
+from slatprep.inspect.verify import WORDS
 from slatprep.pipeline.previous import SourceStore
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing

@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, StoreError
+from slatprep.errors import InputError, SlatprepError, StoreError
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.voxels import flat_index
 from slatprep.inspect.check import TOLERANCES, recompute_annotation
-from slatprep.inspect.verify.merged import merged_findings
 from slatprep.judge import voxel_confidence
 from slatprep.judge.evidence import labels_hold
-from slatprep.normalize import normalize_change
+from slatprep.normalize import normalize_change, normalize_properties
+from slatprep.pipeline.annotate import annotate
 from slatprep.pipeline.fingerprint import code_fingerprint
 from slatprep.pipeline.previous import PLACE_TOLERANCE, SourceStore
+from slatprep.readers import read_field
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
     LATENT_ROLES,
     UNANNOTATED,
     Annotation,
+    AssetPair,
+    Contribution,
     Model,
     Normalization,
     Place,
     SourceRoots,
 )
+from slatprep.sample import in_table, merge
 from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
@@ -39,7 +44,8 @@ from slatprep.store.record_json import RecordError, columns_of, digest_of
 from slatprep.store.shard_reader import DamagedFileError
 
 CONFIDENCE_TOLERANCE = 1e-5
-"""Largest difference of a voxel's probability: another machine may round sums differently."""
+"""Largest difference of probabilities, shares and normalised spreads: another machine may round
+sums differently."""
 
 
 def asset_findings(
@@ -243,6 +249,66 @@ def source_findings(
         except OSError as error:
             what = f"cannot be read ({error.strerror})"
         yield Finding(str(path), record.asset_id, what, expected)
+
+
+def merged_findings(
+    asset: StoredAsset, record: AssetRecord, roots: SourceRoots
+) -> Iterator[Finding]:
+    """Yield findings where merged labels differ from what sources and recorded alignments give."""
+    latents, contents = asset.latents, asset.store.contents
+    parts = []
+    for one in record.merged:
+        if one.left_out or one.alignment is None or one.judgement is None:
+            continue
+        try:
+            pair = _pair_of(asset, record, one, roots)
+            field = read_field(pair, record.parameters.sample.max_unphysical)
+        except (IndexError, SlatprepError) as error:
+            where = f"sample {one.sample} cannot be looked up again ({error})"
+            yield Finding("sources", asset.asset_id, where, "the sources of the build")
+            return
+        placed = annotate(pair, field, latents, record.parameters, one.alignment, one.judgement)
+        parts.append(in_table(placed.annotation, field, contents))
+    if not parts:
+        yield Finding("asset/record", asset.asset_id, "merges no annotation", "one at least")
+        return
+    made = merge(parts, contents.properties)
+    ranges = asset.store.normalization
+    spread = None if made.spread is None else normalize_change(made.spread, ranges)
+    properties = normalize_properties(made.properties, ranges)
+    now = vars(made) | {"properties": properties, "spread": spread}
+    for name in ("valid", "material", "properties", "confidence", "spread", "votes"):
+        limit = TOLERANCES.get(f"voxel/{name}", CONFIDENCE_TOLERANCE)
+        held, given = getattr(asset, name), np.asarray(now[name], dtype=np.float64)
+        same = np.isclose(held, given, rtol=0.0, atol=limit, equal_nan=True)
+        wrong = int(np.count_nonzero(~same.reshape(len(same), -1).all(axis=1)))
+        if wrong:
+            what = f"{wrong} of {len(same)} voxels differ"
+            yield Finding(f"voxel/{name}", asset.asset_id, what, "what the sources give, merged")
+
+
+def _pair_of(
+    asset: StoredAsset, record: AssetRecord, one: Contribution, roots: SourceRoots
+) -> AssetPair:
+    """Return where the files of one annotation are now."""
+    found = [record.sources[k] for k in one.sources]
+    own = (roots, *roots.also)[found[0].source]
+    files = {file.role: own.pixieverse / file.path for file in found}
+    slat = next(roots.slat / file.path for file in record.sources if file.role == "slat")
+    return AssetPair(
+        record.asset_id,
+        record.object_id,
+        record.view,
+        record.category,
+        replace(own, contents=asset.store.contents),
+        files.get("grid"),
+        files.get("mask"),
+        files.get("bounds"),
+        slat,
+        transform=files.get("transform"),
+        beside=tuple(own.pixieverse / file.path for file in found if file.role == "description"),
+        sample=one.sample,
+    )
 
 
 def roundings(normalization: Normalization) -> NDArray[np.float64]:
