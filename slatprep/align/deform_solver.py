@@ -66,7 +66,7 @@ def linearise(here, there, pose, warp, lines, forward, tau):  # type: ignore[no-
     `forward` the `lines`' places are improved first: a few steps of a fixed-point iteration
     from the last known place. Where the warp has no lattice it is not looked at.
     """
-    points, values, field, field_origin = here.points, here.values, there.distance, there.origin
+    columns, values, field, field_origin = here.columns, here.values, there.distance, there.origin
     places, bases, weights = lines.places, lines.bases, lines.weights
     vectors, residuals = lines.vectors, lines.residuals
     rotation, shift, scale, offset = pose.rotation, pose.shift, pose.scale, warp.offset
@@ -82,9 +82,9 @@ def linearise(here, there, pose, warp, lines, forward, tau):  # type: ignore[no-
     steps = 0 if forward else (_INVERSE_STEPS if bent else 1)
     moved = np.zeros(3)
     flat, strides = coefficients.reshape(-1), strides_of(coefficients.shape)
-    for m in range(points.shape[0]):
+    for m in range(len(values)):
         if not forward:
-            p = points[m]
+            p = columns[0, m], columns[1, m], columns[2, m]
             for axis in range(3):
                 moved[axis] = shift[axis] + scale * (
                     rotation[axis, 0] * p[0] + rotation[axis, 1] * p[1] + rotation[axis, 2] * p[2]

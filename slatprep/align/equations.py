@@ -27,6 +27,7 @@ AFFINE = 13  # unknowns: nine of the matrix and three of the shift, row by row, 
 
 _BLOCK = 64  # samples a step at a time: what is kept of them stays in the processor's first cache
 _LANES = 8  # sums of each product, of every eighth sample each: as many on any processor
+_STEP = 32  # samples whose products are added to the sums at once, before these are stored again
 _FEW = ((0, 0), (0, 3), (0, 6), (3, 3), (3, 6), (6, 6))
 _MANY = (*_FEW, (0, 9), (0, 12), (3, 9), (3, 12), (6, 9), (6, 12), (9, 9), (9, 12), (12, 12))
 # First row and column of each block of three by three products in the upper triangle.
@@ -34,8 +35,7 @@ _SIZE = 15  # rows of A, the unknowns and the residual, in whole blocks
 _VALUE, _GX, _GY, _GZ, _U, _V, _W, _X, _Y, _Z, _OX, _OY, _OZ, _BEYOND, _ROWS = range(
     0, 15 * _BLOCK, _BLOCK
 )
-_WEIGHTED = _ROWS + _SIZE * _BLOCK
-_SUMS = _WEIGHTED + _SIZE * _BLOCK
+_SUMS = _ROWS + _SIZE * _BLOCK
 _NUMBERS = _SUMS + 9 * len(_MANY) * _LANES
 """How many numbers a block has, and before it where those of each kind begin: in one array, which
 is no other's memory, so that the compiler makes vector instructions of the loops over them."""
@@ -56,41 +56,54 @@ class Link(NamedTuple):
     forward: bool
 
 
+class Equations(NamedTuple):
+    """Equations of which the upper triangle counts, and the memory of a block while they grow."""
+
+    products: NDArray[np.float64]
+    block: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    corners: NDArray[np.float32]
+
+
+@kernel()
+def new_equations():  # type: ignore[no-untyped-def]
+    """Return equations of nothing."""
+    cells, corners = np.empty(_BLOCK, np.int64), np.empty(8 * _BLOCK, np.float32)
+    return Equations(np.zeros((_SIZE, _SIZE)), np.empty(_NUMBERS), cells, corners)
+
+
 @kernel(error_model="numpy")
 def accumulate(here, there, link, centre, tau, weight, unknowns, equations):  # type: ignore[no-untyped-def]
-    """Add one side's residuals, times `weight`, to the upper triangle of the equations."""
-    block, cells = np.empty(_NUMBERS), np.empty(_BLOCK, np.int64)
-    corners = np.empty(8 * _BLOCK, np.float32)
+    """Add one side's residuals, times `weight`, to the equations."""
+    block = equations.block
     blocks = len(_FEW) if unknowns == SIMILARITY else len(_MANY)
     block[_SUMS : _SUMS + 9 * blocks * _LANES] = 0.0
-    for first in range(0, here.points.shape[0], _BLOCK):
-        points, values = here.points[first : first + _BLOCK], here.values[first : first + _BLOCK]
-        _carry(points, link, there.origin, there.distance.shape, block, cells)
-        _look_up(there.distance, cells, len(points), corners, block)
-        _weigh(values, link, tau, block)
-        _linearise(len(points), link, centre, block)
+    for first in range(0, len(here.values), _BLOCK):
+        values = here.values[first : first + _BLOCK]
+        _residuals_of(here.columns, first, values, link, there, tau, equations)
+        _linearise(len(values), link, centre, weight, block)
         if unknowns == SIMILARITY:
-            _rows_of_similarity(len(points), link.forward, weight, block)
-            _add_products(len(points), block)
+            _rows_of_similarity(len(values), link.forward, block)
+            _add_products(len(values), block)
         else:
-            _rows_of_affine(len(points), link.forward, weight, block)
-            _add_products(len(points), block)
-            _add_more_products(len(points), block)
-    _add_sums(blocks, block, equations)
+            _rows_of_affine(len(values), link.forward, block)
+            _add_products(len(values), block)
+            _add_more_products(len(values), block)
+    _add_sums(blocks, block, equations.products)
 
 
 @kernel(error_model="numpy")
-def fit_of(here, there, link):  # type: ignore[no-untyped-def]
-    """Of one side at tau = 1, the summed kernel, and the number and squares of the inliers."""
-    block, cells = np.empty(_ROWS), np.empty(_BLOCK, np.int64)
-    corners = np.empty(8 * _BLOCK, np.float32)
+def fit_of(here, there, link, equations):  # type: ignore[no-untyped-def]
+    """Of one side at tau = 1, the summed kernel, and the number and squares of the inliers.
+
+    Of the equations the memory is used.
+    """
+    block = equations.block
     kernels, inliers, sum_of_squares = 0.0, 0, 0.0
-    for first in range(0, here.points.shape[0], _BLOCK):
-        points, values = here.points[first : first + _BLOCK], here.values[first : first + _BLOCK]
-        _carry(points, link, there.origin, there.distance.shape, block, cells)
-        _look_up(there.distance, cells, len(points), corners, block)
-        _weigh(values, link, 1.0, block)
-        for m in range(len(points)):
+    for first in range(0, len(here.values), _BLOCK):
+        values = here.values[first : first + _BLOCK]
+        _residuals_of(here.columns, first, values, link, there, 1.0, equations)
+        for m in range(len(values)):
             square = block[_V + m]
             near = square <= 1.0
             kernels += block[_U + m]
@@ -100,24 +113,34 @@ def fit_of(here, there, link):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="numpy")
-def _carry(points, link, origin, shape, block, cells):  # type: ignore[no-untyped-def]
+def _residuals_of(columns, first, values, link, there, tau, equations):  # type: ignore[no-untyped-def]
+    """Set a block's residuals, and all that is known of them, from the number `first` on."""
+    block, cells = equations.block, equations.cells
+    _carry(columns, first, len(values), link, there, block, cells)
+    _look_up(there.distance, cells, len(values), equations.corners, block)
+    _weigh(values, link, tau, block)
+
+
+@kernel(error_model="numpy")
+def _carry(columns, first, count, link, there, block, cells):  # type: ignore[no-untyped-def]
     """Find the points in the SLAT frame, and their cells and places in the other side's field."""
     # Out of the loop, as the compiler cannot know that what it writes is not one of these.
-    matrix, shift = link.matrix, link.shift
+    matrix, shift, origin = link.matrix, link.shift, there.origin
     m00, m01, m02, s0 = matrix[0, 0], matrix[0, 1], matrix[0, 2], shift[0]
     m10, m11, m12, s1 = matrix[1, 0], matrix[1, 1], matrix[1, 2], shift[1]
     m20, m21, m22, s2 = matrix[2, 0], matrix[2, 1], matrix[2, 2], shift[2]
     o0, o1, o2 = origin[0], origin[1], origin[2]
-    n0, n1, n2 = shape
-    forward = link.forward
-    for m in range(len(points)):
-        x, y, z = points[m, 0], points[m, 1], points[m, 2]
+    n0, n1, n2 = there.distance.shape
+    forward, end = link.forward, first + count
+    xs, ys, zs = columns[0, first:end], columns[1, first:end], columns[2, first:end]
+    for m in range(count):
+        x, y, z = xs[m], ys[m], zs[m]
         a = m00 * x + m01 * y + m02 * z + s0
         b = m10 * x + m11 * y + m12 * z + s1
         c = m20 * x + m21 * y + m22 * z + s2
         block[_X + m], block[_Y + m], block[_Z + m] = (x, y, z) if forward else (a, b, c)
         block[_OX + m], block[_OY + m], block[_OZ + m] = a - o0, b - o1, c - o2
-    for m in range(len(points)):
+    for m in range(count):
         x, y, z = block[_OX + m], block[_OY + m], block[_OZ + m]
         cx = min(max(x, 0.0), n0 - 1.000001)
         cy = min(max(y, 0.0), n1 - 1.000001)
@@ -149,7 +172,10 @@ def _look_up(field, cells, count, corners, block):  # type: ignore[no-untyped-de
             corners[7 * _BLOCK + m], block[_U + m], block[_V + m], block[_W + m],
         )  # fmt: skip
         block[_VALUE + m], block[_GX + m], block[_GY + m], block[_GZ + m] = value, gx, gy, gz
+    beyond = 0
     for m in range(count):
+        beyond += block[_BEYOND + m] > 1e-8
+    for m in range(count if beyond else 0):
         outside = block[_BEYOND + m]
         if outside > 1e-8:
             outside = math.sqrt(outside)
@@ -175,8 +201,8 @@ def _weigh(values, link, tau, block):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="numpy")
-def _linearise(count, link, centre, block):  # type: ignore[no-untyped-def]
-    """Set a block's g and q."""
+def _linearise(count, link, centre, weight, block):  # type: ignore[no-untyped-def]
+    """Set a block's g and q, and W (U); weights and rows of zeros make it as long as a step."""
     turn = link.turn
     r00, r01, r02 = turn[0, 0], turn[0, 1], turn[0, 2]
     r10, r11, r12 = turn[1, 0], turn[1, 1], turn[1, 2]
@@ -190,16 +216,21 @@ def _linearise(count, link, centre, block):  # type: ignore[no-untyped-def]
         block[_X + m] -= c0
         block[_Y + m] -= c1
         block[_Z + m] -= c2
+        kernel = block[_U + m]
+        block[_U + m] = weight * kernel * kernel
+    end = -(-count // _STEP) * _STEP
+    block[_U + count : _U + end] = 0.0
+    for row in range(_ROWS, _SUMS, _BLOCK):
+        block[row + count : row + end] = 0.0
 
 
 @kernel(error_model="numpy")
-def _rows_of_similarity(count, forward, weight, block):  # type: ignore[no-untyped-def]
-    """Set a block's rows of A and of W A; rows of zeros make it as long as all lanes."""
+def _rows_of_similarity(count, forward, block):  # type: ignore[no-untyped-def]
+    """Set a block's rows of A."""
     sign = -1.0 if forward else 1.0
     for m in range(count):
         gx, gy, gz = block[_GX + m], block[_GY + m], block[_GZ + m]
         qx, qy, qz = block[_X + m], block[_Y + m], block[_Z + m]
-        kernel = block[_U + m]
         block[_ROWS + m] = qz * gy - qy * gz
         block[_ROWS + _BLOCK + m] = qx * gz - qz * gx
         block[_ROWS + 2 * _BLOCK + m] = qy * gx - qx * gy
@@ -209,23 +240,15 @@ def _rows_of_similarity(count, forward, weight, block):  # type: ignore[no-untyp
         block[_ROWS + 6 * _BLOCK + m] = -(gx * qx + gy * qy + gz * qz)
         block[_ROWS + 7 * _BLOCK + m] = sign
         block[_ROWS + 8 * _BLOCK + m] = block[_VALUE + m]
-        for i in range(9):
-            block[_WEIGHTED + i * _BLOCK + m] = (
-                weight * kernel * kernel * block[_ROWS + i * _BLOCK + m]
-            )
-    for m in range(count, -(-count // _LANES) * _LANES):
-        for i in range(9):
-            block[_ROWS + i * _BLOCK + m] = block[_WEIGHTED + i * _BLOCK + m] = 0.0
 
 
 @kernel(error_model="numpy")
-def _rows_of_affine(count, forward, weight, block):  # type: ignore[no-untyped-def]
+def _rows_of_affine(count, forward, block):  # type: ignore[no-untyped-def]
     """Do the same for an affine map; its last row is of zeros."""
     sign = -1.0 if forward else 1.0
     for m in range(count):
         gx, gy, gz = block[_GX + m], block[_GY + m], block[_GZ + m]
         qx, qy, qz = block[_X + m], block[_Y + m], block[_Z + m]
-        kernel = block[_U + m]
         block[_ROWS + m] = gx * qx
         block[_ROWS + _BLOCK + m] = gx * qy
         block[_ROWS + 2 * _BLOCK + m] = gx * qz
@@ -241,19 +264,12 @@ def _rows_of_affine(count, forward, weight, block):  # type: ignore[no-untyped-d
         block[_ROWS + 12 * _BLOCK + m] = sign
         block[_ROWS + 13 * _BLOCK + m] = block[_VALUE + m]
         block[_ROWS + 14 * _BLOCK + m] = 0.0
-        for i in range(_SIZE):
-            block[_WEIGHTED + i * _BLOCK + m] = (
-                weight * kernel * kernel * block[_ROWS + i * _BLOCK + m]
-            )
-    for m in range(count, -(-count // _LANES) * _LANES):
-        for i in range(_SIZE):
-            block[_ROWS + i * _BLOCK + m] = block[_WEIGHTED + i * _BLOCK + m] = 0.0
 
 
 @kernel()
 def _add_products(count, block):  # type: ignore[no-untyped-def]
     """Add a block's products to their sums; of the symmetric matrix the upper triangle alone."""
-    for first in range(0, _BLOCK, _LANES):
+    for first in range(0, _BLOCK, _STEP):
         # Not the end of the range: the compiler would have to expect a negative `first`, and
         # a check of each index keeps it from vector instructions.
         if first >= count:
@@ -269,7 +285,7 @@ def _add_products(count, block):  # type: ignore[no-untyped-def]
 @kernel()
 def _add_more_products(count, block):  # type: ignore[no-untyped-def]
     """Add those that only an affine map has."""
-    for first in range(0, _BLOCK, _LANES):
+    for first in range(0, _BLOCK, _STEP):
         if first >= count:
             break
         _add_nine_products(block, first, 0, 9, 6)
@@ -289,25 +305,28 @@ def _add_nine_products(block, first, row, column, number):  # type: ignore[no-un
 
     Written out, and the numbers constants, so that the compiler makes vectors of the lanes.
     """
-    left, right = _WEIGHTED + row * _BLOCK + first, _ROWS + column * _BLOCK + first
-    for m in range(_LANES):
-        p, q, r = block[left + m], block[left + _BLOCK + m], block[left + 2 * _BLOCK + m]
-        x, y, z = block[right + m], block[right + _BLOCK + m], block[right + 2 * _BLOCK + m]
-        at = _SUMS + 9 * number * _LANES + m
-        block[at] += p * x
-        block[at + _LANES] += p * y
-        block[at + 2 * _LANES] += p * z
-        block[at + 3 * _LANES] += q * x
-        block[at + 4 * _LANES] += q * y
-        block[at + 5 * _LANES] += q * z
-        block[at + 6 * _LANES] += r * x
-        block[at + 7 * _LANES] += r * y
-        block[at + 8 * _LANES] += r * z
+    left, right = _ROWS + row * _BLOCK + first, _ROWS + column * _BLOCK + first
+    for lane in range(_LANES):
+        at = _SUMS + 9 * number * _LANES + lane
+        a, b, c = block[at], block[at + _LANES], block[at + 2 * _LANES]
+        d, e, f = block[at + 3 * _LANES], block[at + 4 * _LANES], block[at + 5 * _LANES]
+        g, h, i = block[at + 6 * _LANES], block[at + 7 * _LANES], block[at + 8 * _LANES]
+        for m in range(lane, lane + _STEP, _LANES):
+            weight = block[_U + first + m]
+            p, q, r = block[left + m], block[left + _BLOCK + m], block[left + 2 * _BLOCK + m]
+            p, q, r = weight * p, weight * q, weight * r
+            x, y, z = block[right + m], block[right + _BLOCK + m], block[right + 2 * _BLOCK + m]
+            a, b, c = a + p * x, b + p * y, c + p * z
+            d, e, f = d + q * x, e + q * y, f + q * z
+            g, h, i = g + r * x, h + r * y, i + r * z
+        block[at], block[at + _LANES], block[at + 2 * _LANES] = a, b, c
+        block[at + 3 * _LANES], block[at + 4 * _LANES], block[at + 5 * _LANES] = d, e, f
+        block[at + 6 * _LANES], block[at + 7 * _LANES], block[at + 8 * _LANES] = g, h, i
 
 
 @kernel()
-def _add_sums(blocks, block, equations):  # type: ignore[no-untyped-def]
-    """Add up the lanes, and add the sums to the upper triangle of the equations."""
+def _add_sums(blocks, block, products):  # type: ignore[no-untyped-def]
+    """Add up the lanes, and add the sums to the upper triangle of all products."""
     for number in range(9 * blocks):
         at = _SUMS + number * _LANES
         even = (block[at] + block[at + 4]) + (block[at + 2] + block[at + 6])
@@ -318,23 +337,27 @@ def _add_sums(blocks, block, equations):  # type: ignore[no-untyped-def]
         row, column = _MANY[k]
         for i in range(row, row + 3):
             for j in range(column, column + 3):
-                equations[i, j] += block[number]
+                products[i, j] += block[number]
                 number += 1
 
 
 @kernel()
-def new_equations():  # type: ignore[no-untyped-def]
-    """Return equations of nothing."""
-    return np.zeros((_SIZE, _SIZE))
+def centre_of(samples):  # type: ignore[no-untyped-def]
+    """Return the mean place (3,) of samples."""
+    centre = np.zeros(3)
+    for axis in range(3):
+        for place in samples.columns[axis]:
+            centre[axis] += place
+    return centre / len(samples.values)
 
 
 @kernel()
-def matrix_and_rhs(equations, unknowns, normal, rhs):  # type: ignore[no-untyped-def]
+def matrix_and_rhs(products, unknowns, normal, rhs):  # type: ignore[no-untyped-def]
     """Take the equations apart into the whole normal matrix and the right-hand side."""
     for i in range(unknowns):
-        rhs[i] = -equations[i, unknowns]
+        rhs[i] = -products[i, unknowns]
         for j in range(unknowns):
-            normal[i, j] = equations[min(i, j), max(i, j)]
+            normal[i, j] = products[min(i, j), max(i, j)]
 
 
 @kernel()
@@ -346,7 +369,9 @@ def solve_linear(matrix, rhs, step):  # type: ignore[no-untyped-def]
     """
     n = len(rhs)
     for i in range(n):
-        pivot = i + np.argmax(np.abs(matrix[i:, i]))
+        pivot = i
+        for k in range(i + 1, n):
+            pivot = k if abs(matrix[k, i]) > abs(matrix[pivot, i]) else pivot
         if pivot != i:
             for j in range(i, n):
                 matrix[i, j], matrix[pivot, j] = matrix[pivot, j], matrix[i, j]

@@ -43,11 +43,12 @@ class Residuals:
         self, slat: Surface, pixie: Surface, pose: Similarity, samples: int, first: int = 0
     ) -> None:
         self.surface = slat
-        self._slat, self._pixie = (side.subset(samples, first).samples for side in (slat, pixie))
+        here, there = slat.subset(samples, first), pixie.subset(samples, first)
+        self._slat, self._pixie = here.samples, there.samples
         self._pose = pose._replace(rotation=np.ascontiguousarray(pose.rotation))
-        carried = pose.scale * self._pixie.points @ pose.rotation.T + pose.shift
-        self._lines = Lines.at(np.concatenate([self._slat.points, carried]))
-        self._pixie_rows = len(self._slat.points)
+        carried = pose.scale * there.points @ pose.rotation.T + pose.shift
+        self._lines = Lines.at(np.concatenate([here.points, carried]))
+        self._pixie_rows = len(here.points)
         box = slat.points.min(axis=0) - 1.0, slat.points.max(axis=0) + 1.0
         self._low, self._side = box[0], box[1] - box[0]
 
@@ -126,4 +127,6 @@ class Residuals:
 
 
 def _some(samples: Samples, chosen: NDArray[np.intp]) -> Samples:
-    return samples._replace(points=samples.points[chosen], values=samples.values[chosen])
+    return samples._replace(
+        columns=samples.columns.take(chosen, axis=1), values=samples.values[chosen]
+    )

@@ -26,6 +26,7 @@ from slatprep.align.equations import (
     SIMILARITY,
     Link,
     accumulate,
+    centre_of,
     fit_of,
     matrix_and_rhs,
     new_equations,
@@ -84,13 +85,11 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
     PixieVerse samples, the share of all samples within one voxel, and the rms
     residual of those.
     """
-    centre = np.zeros(3)
-    for m in range(slat.points.shape[0]):
-        centre += slat.points[m]
-    centre /= slat.points.shape[0]
+    centre = centre_of(slat)
     scale_low, scale_high = scale_bounds
-    samples = slat.points.shape[0] + pixie.points.shape[0]
-    equations, by_slat = new_equations(), new_equations()
+    samples = len(slat.values) + len(pixie.values)
+    equations = new_equations()
+    products = equations.products
     normal, rhs = np.zeros((SIMILARITY, SIMILARITY)), np.zeros(SIMILARITY)
     step = np.zeros(SIMILARITY)
     memory = np.empty((3, 3)), np.empty((3, 3)), -np.eye(3), np.empty(3)
@@ -100,13 +99,13 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
         scale, offset = poses.scales[pose], poses.offsets[pose]
         for tau in taus:
             there, here = _links(rotation, shift, scale, offset, memory)
-            equations[:] = 0.0
+            products[:] = 0.0
             accumulate(slat, pixie, there, centre, tau, 1.0, SIMILARITY, equations)
-            by_slat[:] = equations
+            by_slat = products.copy() if size_by_slat else products
             accumulate(pixie, slat, here, centre, tau, 1.0, SIMILARITY, equations)
             if size_by_slat:
-                equations[6:, 6:] = 2.0 * by_slat[6:, 6:]
-            matrix_and_rhs(equations, SIMILARITY, normal, rhs)
+                products[6:, 6:] = 2.0 * by_slat[6:, 6:]
+            matrix_and_rhs(products, SIMILARITY, normal, rhs)
             if size_by_slat:
                 for i in range(6, SIMILARITY):
                     normal[i, :6] = 2.0 * by_slat[:6, i]
@@ -128,30 +127,34 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
             growth = math.exp(min(max(step[6], -_LARGEST_GROWTH), _LARGEST_GROWTH))
             growth = min(max(growth, scale_low / scale), scale_high / scale)
             turn = _rotation_of(step)
-            shift[:] = centre + growth * _product(turn, shift - centre) + step[3:6]
-            for column in range(3):
-                rotation[:, column] = _product(turn, rotation[:, column])
+            away = _product(turn, shift[0] - centre[0], shift[1] - centre[1], shift[2] - centre[2])
+            for axis in range(3):
+                shift[axis] = centre[axis] + growth * away[axis] + step[3 + axis]
+            for axis in range(3):
+                x, y, z = rotation[0, axis], rotation[1, axis], rotation[2, axis]
+                rotation[0, axis], rotation[1, axis], rotation[2, axis] = _product(turn, x, y, z)
             scale *= growth
             offset += step[7]
             moved = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
             if moved + _LEVER * (angle + abs(growth - 1.0)) < tolerance:
                 break
         there, here = _links(rotation, shift, scale, offset, memory)
-        ours, near, squares = fit_of(slat, pixie, there)
-        theirs, near_theirs, squares_theirs = fit_of(pixie, slat, here)
+        ours, near, squares = fit_of(slat, pixie, there, equations)
+        theirs, near_theirs, squares_theirs = fit_of(pixie, slat, here, equations)
         inliers = near + near_theirs
         poses.scales[pose], poses.offsets[pose] = scale, offset
-        fits[pose, 0] = ours / slat.points.shape[0]
-        fits[pose, 1] = theirs / pixie.points.shape[0]
+        fits[pose, 0] = ours / len(slat.values)
+        fits[pose, 1] = theirs / len(pixie.values)
         fits[pose, 2] = inliers / samples
         fits[pose, 3] = math.sqrt((squares + squares_theirs) / max(inliers, 1))
     return fits
 
 
 @kernel()
-def _product(matrix, vector):  # type: ignore[no-untyped-def]
-    product = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            product[i] += matrix[i, j] * vector[j]
-    return product
+def _product(matrix, x, y, z):  # type: ignore[no-untyped-def]
+    """Return a matrix (3, 3) times a vector."""
+    return (
+        0.0 + matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        0.0 + matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        0.0 + matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
+    )

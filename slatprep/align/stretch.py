@@ -14,6 +14,7 @@ from slatprep.align.equations import (
     AFFINE,
     Link,
     accumulate,
+    centre_of,
     fit_of,
     invert,
     matrix_and_rhs,
@@ -53,12 +54,9 @@ def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
     kernel at tau = 1 voxel of each, the sides with equal weight. A step that would squash the
     shape flat is not taken, and the score is 0 then.
     """
-    here, back = slat.points.shape[0], pixie.points.shape[0]
+    here, back = len(slat.values), len(pixie.values)
     equations, normal, rhs = new_equations(), np.zeros((AFFINE, AFFINE)), np.zeros(AFFINE)
-    step, inverse, centre = np.zeros(AFFINE), np.zeros((3, 3)), np.zeros(3)
-    for m in range(here):
-        centre += slat.points[m]
-    centre /= here
+    step, inverse, centre = np.zeros(AFFINE), np.zeros((3, 3)), centre_of(slat)
     scores = np.zeros(len(poses.scales))
     for pose in range(len(poses.scales)):
         rotation, shift, scale = poses.rotations[pose], poses.shifts[pose], poses.scales[pose]
@@ -70,15 +68,16 @@ def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
             offset = poses.offsets[pose]
             forward, backward = _links(rotation, shift, scale, offset, affine, inverse)
             if turn == len(taus):
-                ours, theirs = fit_of(slat, pixie, forward)[0], fit_of(pixie, slat, backward)[0]
-                scores[pose] = 0.5 * (ours / here + theirs / back)
+                ours = fit_of(slat, pixie, forward, equations)[0] / here
+                theirs = fit_of(pixie, slat, backward, equations)[0] / back
+                scores[pose] = 0.5 * (ours + theirs)
                 break
             before[:] = affine
             tau, count = taus[turn], here + back
-            equations[:] = 0.0
+            equations.products[:] = 0.0
             accumulate(slat, pixie, forward, centre, tau, 1.0, AFFINE, equations)
             accumulate(pixie, slat, backward, centre, tau, PIXIEVERSE_WEIGHT, AFFINE, equations)
-            matrix_and_rhs(equations, AFFINE, normal, rhs)
+            matrix_and_rhs(equations.products, AFFINE, normal, rhs)
             normal[12, 12] += OFFSET_PRIOR * count
             rhs[12] -= OFFSET_PRIOR * count * offset
             for i in range(AFFINE):

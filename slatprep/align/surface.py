@@ -39,7 +39,7 @@ _MARGIN = 4
 class Samples(NamedTuple):
     """A surface as kernels take it: samples, and the field that other samples look up."""
 
-    points: NDArray[np.float64]  # (M, 3), voxels from the cube's centre
+    columns: NDArray[np.float64]  # (3, M), voxels from the cube's centre
     values: NDArray[np.float64]  # (M,), signed distance [voxel]
     distance: NDArray[np.float32]  # (a, b, c), signed distance [voxel]
     origin: NDArray[np.float64]  # (3,), where distance[0, 0, 0] lies
@@ -70,10 +70,11 @@ class Surface:
     boundary: NDArray[np.uint8]
     _subsets: dict[tuple[int, int], Surface] = field(init=False, default_factory=dict)
 
-    @property
+    @cached_property
     def samples(self) -> Samples:
         """What kernels need of it."""
-        return Samples(self.points, self.values, self.distance, self.origin)
+        columns = np.ascontiguousarray(self.points.T)
+        return Samples(columns, self.values, self.distance, self.origin)
 
     @cached_property
     def centroid(self) -> NDArray[np.float64]:
@@ -162,7 +163,7 @@ def normals_of(surface: Samples) -> NDArray[np.float64]:
     flat = distance.reshape(-1)
     strides = np.array(distance.strides) // distance.itemsize
     # Samples are lattice points, and the box has a margin around all of them.
-    at = np.rint(surface.points - surface.origin).astype(np.intp) @ strides
+    at = np.rint(surface.columns.T - surface.origin).astype(np.intp) @ strides
     normals = np.stack([flat[at + step] - flat[at - step] for step in strides], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     found: NDArray[np.float64] = normals / np.maximum(length, 1e-6)
