@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slatprep.geometry.frames import voxel_centres
 from slatprep.normalize import from_mapped, to_mapped
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
-    RESOLUTION,
     UNANNOTATED,
     Annotation,
     Contents,
@@ -55,16 +53,14 @@ def sample(
     place = np.asarray(places, dtype=np.float32)
     points = place.astype(np.float64)
     limit = parameters.max_distance * (1.0 + 1e-12) if labels_alone else np.inf
-    distance, used = lattice.nearest(points, limit)
-    valid = distance <= parameters.max_distance
     if parameters.method == "vote":
-        found = distance, used
-        voted = lattice.vote(points, field.material, parameters.vote_width, found)
-        changed = valid & (voted >= 0) & (voted != used)
-        used = np.where(changed, voted, used)
-        apart = points[changed] - voxel_centres(field.voxels[used[changed]])
-        distance[changed] = np.linalg.norm(apart, axis=1) * RESOLUTION
-    properties, material = field.properties[used], field.material[used]
+        distance, used, valid = lattice.voted(
+            points, field.material, parameters.vote_width, parameters.max_distance, limit
+        )
+    else:
+        distance, used = lattice.nearest(points, limit)
+        valid = distance <= parameters.max_distance
+    properties, material = field.properties.take(used, axis=0), field.material.take(used)
     properties[~valid] = np.nan
     material[~valid] = UNANNOTATED
     return Annotation(properties, material, valid, distance.astype(np.float32), place)

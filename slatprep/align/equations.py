@@ -84,11 +84,9 @@ def accumulate(here, there, link, centre, tau, weight, unknowns, equations):  # 
         _linearise(len(values), link, centre, weight, block)
         if unknowns == SIMILARITY:
             _rows_of_similarity(len(values), link.forward, block)
-            _add_products(len(values), block)
         else:
             _rows_of_affine(len(values), link.forward, block)
-            _add_products(len(values), block)
-            _add_more_products(len(values), block)
+        _add_products(len(values), unknowns, block)
     _add_sums(blocks, block, equations.products)
 
 
@@ -267,7 +265,7 @@ def _rows_of_affine(count, forward, block):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _add_products(count, block):  # type: ignore[no-untyped-def]
+def _add_products(count, unknowns, block):  # type: ignore[no-untyped-def]
     """Add a block's products to their sums; of the symmetric matrix the upper triangle alone."""
     for first in range(0, _BLOCK, _STEP):
         # Not the end of the range: the compiler would have to expect a negative `first`, and
@@ -280,23 +278,16 @@ def _add_products(count, block):  # type: ignore[no-untyped-def]
         _add_nine_products(block, first, 3, 3, 3)
         _add_nine_products(block, first, 3, 6, 4)
         _add_nine_products(block, first, 6, 6, 5)
-
-
-@kernel()
-def _add_more_products(count, block):  # type: ignore[no-untyped-def]
-    """Add those that only an affine map has."""
-    for first in range(0, _BLOCK, _STEP):
-        if first >= count:
-            break
-        _add_nine_products(block, first, 0, 9, 6)
-        _add_nine_products(block, first, 0, 12, 7)
-        _add_nine_products(block, first, 3, 9, 8)
-        _add_nine_products(block, first, 3, 12, 9)
-        _add_nine_products(block, first, 6, 9, 10)
-        _add_nine_products(block, first, 6, 12, 11)
-        _add_nine_products(block, first, 9, 9, 12)
-        _add_nine_products(block, first, 9, 12, 13)
-        _add_nine_products(block, first, 12, 12, 14)
+        if unknowns == AFFINE:
+            _add_nine_products(block, first, 0, 9, 6)
+            _add_nine_products(block, first, 0, 12, 7)
+            _add_nine_products(block, first, 3, 9, 8)
+            _add_nine_products(block, first, 3, 12, 9)
+            _add_nine_products(block, first, 6, 9, 10)
+            _add_nine_products(block, first, 6, 12, 11)
+            _add_nine_products(block, first, 9, 9, 12)
+            _add_nine_products(block, first, 9, 12, 13)
+            _add_nine_products(block, first, 12, 12, 14)
 
 
 @kernel(inline="always")

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from slatprep.geometry.distance import NOTHING, spread
 from slatprep.geometry.kernel import kernel
-from slatprep.geometry.voxels import flat_index
 from slatprep.records import RESOLUTION
 
 _REACH = 3  # voxels searched by cells before columns are
@@ -34,11 +33,10 @@ class Lattice:
         if len(voxels) == 0:
             raise ValueError("the nearest voxel of an empty set does not exist")
         self._row = np.full((RESOLUTION,) * 3, -1, dtype=np.int32)
-        self._row.reshape(-1)[flat_index(voxels)] = np.arange(len(voxels), dtype=np.int32)
+        self._blocks = np.zeros((RESOLUTION // _BLOCK,) * 3, dtype=bool)
+        _number(voxels, self._row, self._blocks)
         self._voxels = voxels
         self._alike: tuple[NDArray[np.uint8], NDArray[np.bool_]] | None = None
-        self._blocks = np.zeros((RESOLUTION // _BLOCK,) * 3, dtype=bool)
-        self._blocks[tuple((voxels // _BLOCK).T)] = True
         self._near: dict[float, NDArray[np.bool_]] = {}
 
     def nearest(
@@ -77,28 +75,28 @@ class Lattice:
                     own[:-step] |= before[step:]
         return self._near[reach]
 
-    def vote(
+    def voted(
         self,
         points: NDArray[np.float64],
         labels: NDArray[np.uint8],
         width: float,
-        found: tuple[NDArray[np.float64], NDArray[np.intp]] | None = None,
-    ) -> NDArray[np.intp]:
-        """Return for each point (N, 3) the row (N,) of the voxel that a vote around it chooses.
+        most: float,
+        limit: float = np.inf,
+    ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.bool_]]:
+        """Return what `nearest` does, but of the voxel that a vote chooses; and what was near (N,).
 
-        The voxels in the 27 cells around the point vote for their label (K,) with the weight
-        exp(-d^2 / 2 width^2), d their distance in voxels; the lower label wins a draw. The nearest
-        voxel of the winning label is chosen; -1 where none is there. `found` is what `nearest` gave
-        for the points.
+        Near is a point whose nearest voxel is `most` voxels away or less. Around it the voxels in
+        27 cells vote for their label (K,) with the weight exp(-d^2 / 2 width^2), d their distance
+        in voxels; the lower label wins a draw. The nearest voxel of the winning label is chosen.
         """
-        position, parties = _in_voxels(points), int(labels.max()) + 1
-        found = found or self.nearest(points, limit=_BEYOND)
+        distance, nearest = self.nearest(points, limit)
+        near = distance <= most
         if self._alike is None or self._alike[0] is not labels:
             self._alike = labels, _alike_around(self._voxels, labels)
-        chosen: NDArray[np.intp] = _vote(
-            position, self._row, labels, self._alike[1], *found, parties, 0.5 / width**2
-        )
-        return chosen
+        parties, steepness = int(labels.max()) + 1, 0.5 / width**2
+        alike = self._alike[1]
+        _vote(points, near, self._row, labels, alike, parties, steepness, distance, nearest)
+        return distance, nearest, near
 
 
 def _in_voxels(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -116,6 +114,15 @@ def _cells() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     # Cells beyond the reach may be as near as this; nothing farther is sure.
     sure = floors[order] <= _SURE**2
     return offsets[order][sure].astype(np.int64), floors[order][sure]
+
+
+@kernel()
+def _number(voxels, row, blocks):  # type: ignore[no-untyped-def]
+    """Write the number of each voxel to its cell, and which blocks of cells have any."""
+    for m in range(len(voxels)):
+        a, b, c = voxels[m, 0], voxels[m, 1], voxels[m, 2]
+        row[a, b, c] = m
+        blocks[a // _BLOCK, b // _BLOCK, c // _BLOCK] = True
 
 
 @kernel()
@@ -229,41 +236,49 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
     return distance, nearest
 
 
-def _alike_around(voxels: NDArray[np.uint8], labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+@kernel()
+def _alike_around(voxels, labels):  # type: ignore[no-untyped-def]
     """Say of each cell of the grid with a margin of two whether all voxels around it agree.
 
     Around it are the 27 cells; where none of them is in the set the answer means nothing.
     """
     side = RESOLUTION + 4
     low, high = np.full(side**3, 255, np.uint8), np.zeros(side**3, np.uint8)
-    cells = flat_index(voxels.astype(np.intp) + 2, side)
-    low[cells] = high[cells] = labels
+    for m in range(len(voxels)):
+        a, b, c = voxels[m, 0] + 2, voxels[m, 1] + 2, voxels[m, 2] + 2
+        low[(a * side + b) * side + c] = high[(a * side + b) * side + c] = labels[m]
     # In flattened grids a neighbour is so many places on. What comes of the margin's far side is
-    # no neighbour, and lies in the margin, too.
+    # no neighbour, and lies in the margin, too. Each cell gets what lies from it on, so that at
+    # last a cell has those of the one that is as many places on as is the margin.
     for step in (1, side, side * side):
-        low = np.minimum(np.minimum(low[: -2 * step], low[step:-step]), low[2 * step :])
-        high = np.maximum(np.maximum(high[: -2 * step], high[step:-step]), high[2 * step :])
-    alike = np.zeros(side**3, dtype=bool)
+        for k in range(side**3 - 2 * step):
+            low[k] = min(low[k], low[k + step], low[k + 2 * step])
+            high[k] = max(high[k], high[k + step], high[k + 2 * step])
+    alike = np.zeros(side**3, np.bool_)
     margin = 1 + side + side * side
-    np.equal(low, high, out=alike[margin:-margin])
-    return alike.reshape((side,) * 3)
+    for k in range(side**3 - 2 * margin):
+        alike[k + margin] = low[k] == high[k]
+    return alike.reshape((side, side, side))
 
 
 @kernel()
 def _vote(  # type: ignore[no-untyped-def]
-    position, row, labels, alike, distance, index, n_labels, steepness
+    points, near, row, labels, alike, n_labels, steepness, distance, index
 ):
-    count, size = position.shape[0], row.shape[0]
-    chosen = np.full(count, -1, dtype=np.intp)
+    """Write distance and row of the voxel that is chosen for each point that is near."""
+    size = row.shape[0]
     nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
     voter_label, voter_square = np.zeros(27, dtype=np.intp), np.zeros(27)
     votes = np.zeros(n_labels)
-    for m in range(count):
-        x, y, z = position[m, 0], position[m, 1], position[m, 2]
+    for m in range(len(points)):
+        if not near[m]:
+            continue
+        x = (points[m, 0] + 0.5) * size - 0.5
+        y = (points[m, 1] + 0.5) * size - 0.5
+        z = (points[m, 2] + 0.5) * size - 0.5
         a, b, c = int(np.rint(x)), int(np.rint(y)), int(np.rint(z))
         if distance[m] < _BEYOND and alike[a + 2, b + 2, c + 2]:
-            chosen[m] = index[m]  # Away from borders all voters agree.
-            continue
+            continue  # Away from borders all voters agree.
         voters, parties = 0, 0
         nearest_square[:] = np.inf
         for i in range(max(a - 1, 0), min(a + 2, size)):
@@ -279,11 +294,13 @@ def _vote(  # type: ignore[no-untyped-def]
                     parties += best == np.inf
                     if square < best or (square == best and voxel < nearest[label]):
                         nearest_square[label], nearest[label] = square, voxel
-        if parties == 1:
-            chosen[m] = nearest[voter_label[0]]
-        elif parties > 1:
+        if parties == 0:
+            continue
+        chosen = nearest[voter_label[0]]
+        if parties > 1:
             votes[:] = 0.0
             for voter in range(voters):
                 votes[voter_label[voter]] += math.exp(-voter_square[voter] * steepness)
-            chosen[m] = nearest[np.argmax(votes)]
-    return chosen
+            chosen = nearest[np.argmax(votes)]
+        if chosen != index[m]:
+            distance[m], index[m] = math.sqrt(nearest_square[labels[chosen]]), chosen

@@ -14,8 +14,18 @@ DIRECTIONS = 14
 """Cells looked at in each shell: along the axes and the diagonals of space."""
 
 
+def labelled(
+    voxels: NDArray[np.uint8], labels: NDArray[np.uint8], reach: int, empty: int
+) -> NDArray[np.uint8]:
+    """Return the labels (K,) of voxels (K, 3) by cell, in a grid with a margin; else `empty`."""
+    # Beyond twice the reach no cell of a shell lies in the grid.
+    cells = np.full((RESOLUTION + 4 * reach,) * 3, empty, dtype=np.uint8)
+    _label(voxels, labels, 2 * reach, cells)
+    return cells
+
+
 def shares_around(
-    grid: NDArray[np.uint8],
+    cells: NDArray[np.uint8],
     points: NDArray[np.floating],
     labels: NDArray[np.uint8],
     radii: tuple[int, ...],
@@ -23,30 +33,19 @@ def shares_around(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Look at the cells at some distances of points (N, 3), and say how they are labelled.
 
-    Each of the `radii` (voxels) is a shell of `DIRECTIONS` cells; outside the grid all are `empty`.
-    Returns shares (N, len(radii)): of the cells that are not empty those whose label differs from
-    the point's own, 0 where all are empty; and of all cells those that are not empty.
+    `cells` are of `labelled`, and no radius is above its reach. Each of the `radii` (voxels) is
+    a shell of `DIRECTIONS` cells, 0 the point's own. Returns shares (N, len(radii)): of the cells
+    that are not empty those whose label differs from the point's own, 0 where all are empty; and of
+    all cells those that are not empty.
     """
-    # Beyond twice the largest radius no cell of a shell lies in the grid.
-    margin = 2 * max(radii)
-    padded = np.pad(grid, margin, constant_values=empty)
     directions = _directions() if any(radii) else [np.zeros(3)]
     steps = np.rint([[direction * radius for direction in directions] for radius in radii])
-    side = len(padded)
-    others = np.empty((len(points), len(radii)), dtype=np.float32)
-    solid = np.empty_like(others)
-    _look(
-        padded.reshape(-1),
-        np.ascontiguousarray(points, dtype=np.float64),
-        labels,
-        (steps @ (side * side, side, 1)).astype(np.int64),
-        side,
-        margin,
-        empty,
-        others,
-        solid,
-    )
-    return others, solid
+    side = len(cells)
+    found: tuple[NDArray[np.float32], NDArray[np.float32]] = _look(
+        cells.reshape(-1), np.ascontiguousarray(points, dtype=np.float64), labels,
+        (steps @ (side * side, side, 1)).astype(np.int64), side, empty,
+    )  # fmt: skip
+    return found
 
 
 def _directions() -> list[NDArray[np.float64]]:
@@ -56,8 +55,16 @@ def _directions() -> list[NDArray[np.float64]]:
 
 
 @kernel()
-def _look(cells, points, labels, steps, side, margin, empty, others, solid):  # type: ignore[no-untyped-def]
-    half = 0.5 * (RESOLUTION - 1)
+def _label(voxels, labels, margin, cells):  # type: ignore[no-untyped-def]
+    for m in range(len(voxels)):
+        cells[voxels[m, 0] + margin, voxels[m, 1] + margin, voxels[m, 2] + margin] = labels[m]
+
+
+@kernel()
+def _look(cells, points, labels, steps, side, empty):  # type: ignore[no-untyped-def]
+    others = np.empty((len(points), len(steps)), np.float32)
+    solid = np.empty_like(others)
+    half, margin = 0.5 * (RESOLUTION - 1), (side - RESOLUTION) // 2
     low, high = margin // 2, side - 1 - margin // 2
     for m in range(points.shape[0]):
         a = int(np.rint(points[m, 0] * RESOLUTION + half)) + margin
@@ -77,3 +84,4 @@ def _look(cells, points, labels, steps, side, margin, empty, others, solid):  # 
                 differ += (label != empty) & (label != own)
             others[m, shell] = differ / there if there else 0.0
             solid[m, shell] = there / steps.shape[1]
+    return others, solid

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
-from slatprep.geometry.voxels import flat_index
 from slatprep.judge.ambiguity import NOTABLE, thinning
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import (
-    RESOLUTION,
     UNANNOTATED,
     Agreement,
     Alignment,
@@ -107,12 +105,11 @@ def surroundings_of(
     field: MaterialField, latents: StructuredLatents, alignment: Alignment, annotation: Annotation
 ) -> Surroundings:
     """Look at what lies around the places where voxels were looked up."""
-    from slatprep.geometry.surroundings import shares_around
+    from slatprep.geometry.surroundings import labelled, shares_around
 
-    cells, labels = _labels_of(field, annotation)
-    grid = np.full((RESOLUTION,) * 3, UNANNOTATED, dtype=np.uint8)
-    grid.reshape(-1)[flat_index(field.voxels)] = cells
-    others, solid = shares_around(grid, annotation.place, labels, RADII, UNANNOTATED)
+    of_voxels, labels = _labels_of(field, annotation)
+    cells = labelled(field.voxels, of_voxels, max(RADII), UNANNOTATED)
+    others, solid = shares_around(cells, annotation.place, labels, RADII, UNANNOTATED)
     count = len(annotation.place)
     moved = np.zeros(count, dtype=np.float32)
     if alignment.deformation is not None:
@@ -124,8 +121,7 @@ def surroundings_of(
     some = ties[:: thinning(count)]
     for placement in some:
         places = places_of(latents.centres, placement.transform).astype(np.float32)
-        other, there = shares_around(grid, places, labels, (0,), UNANNOTATED)
-        tied += np.where(there[:, 0] > 0, other[:, 0], 0.0)
+        tied += shares_around(cells, places, labels, (0,), UNANNOTATED)[0][:, 0]
     if len(some) < len(ties):
         tied *= np.float32(len(ties) / len(some))
     tied /= np.float32(len(ties) + 1)

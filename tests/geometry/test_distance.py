@@ -8,7 +8,8 @@ from scipy import ndimage
 
 from slatprep.geometry.distance import LARGEST_SIDE, signed_distance
 from slatprep.geometry.fill import outside_of
-from slatprep.geometry.surroundings import DIRECTIONS, shares_around
+from slatprep.geometry.surroundings import DIRECTIONS, labelled, shares_around
+from slatprep.geometry.voxels import voxels_of
 
 
 def _expected(solid: np.ndarray) -> np.ndarray:
@@ -81,12 +82,18 @@ def test_longer_lines_than_a_word_are_refused():
         outside_of(np.zeros((2, 2, 65), dtype=bool))
 
 
+def _shares(grid, points, labels, radii):
+    voxels = voxels_of(grid != 7)
+    cells = labelled(voxels, grid[tuple(voxels.T)], max(radii), 7)
+    return shares_around(cells, points, labels, radii, 7)
+
+
 def test_a_flat_border_by_hand():
     # Class 1 below z = 32, class 2 on it up to z = 40, empty above.
     grid = np.full((64, 64, 64), 7, dtype=np.uint8)
     grid[:, :, :32], grid[:, :, 32:40] = 1, 2
     points = (np.array([[32, 32, 31], [32, 32, 39], [32, 32, 20]]) + 0.5) / 64 - 0.5
-    others, solid = shares_around(grid, points, np.array([1, 2, 1], np.uint8), (1, 2), 7)
+    others, solid = _shares(grid, points, np.array([1, 2, 1], np.uint8), (1, 2))
     # Of the 14 directions five lead up: one axis and four diagonals.
     np.testing.assert_allclose(others[0], 5 / 14)
     np.testing.assert_allclose(solid[1], 9 / 14)
@@ -99,7 +106,7 @@ def test_random_cells_by_plain_numpy():
     grid = rng.integers(5, 8, (64, 64, 64)).astype(np.uint8)
     points = rng.uniform(-0.6, 0.6, (200, 3))
     labels = rng.integers(5, 7, 200).astype(np.uint8)
-    others, solid = shares_around(grid, points, labels, (3,), 7)
+    others, solid = _shares(grid, points, labels, (3,))
     axes = [s * row for row in np.eye(3) for s in (1, -1)]
     corners = [np.array([a, b, c]) / np.sqrt(3) for a in (1, -1) for b in (1, -1) for c in (1, -1)]
     steps = np.rint(3 * np.array(axes + corners)).astype(int)
@@ -116,5 +123,5 @@ def test_random_cells_by_plain_numpy():
 
 def test_a_point_far_outside_sees_nothing():
     grid = np.zeros((64, 64, 64), dtype=np.uint8)
-    others, solid = shares_around(grid, np.array([[2.0, 0.0, 0.0]]), np.zeros(1, np.uint8), (1,), 7)
+    others, solid = _shares(grid, np.array([[2.0, 0.0, 0.0]]), np.zeros(1, np.uint8), (1,))
     assert others[0, 0] == solid[0, 0] == 0.0

@@ -105,22 +105,35 @@ def test_an_empty_set_is_refused():
         Lattice(np.zeros((0, 3), dtype=np.uint8))
 
 
+def _voted(voxels, labels, points, width, most=2.0):
+    return Lattice(voxels).voted(points, labels, width, most)[1].tolist()
+
+
+def test_where_nobody_votes_or_nothing_is_near_the_nearest_stands():
+    voxels = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=np.uint8)
+    points, labels = voxel_centres([[0, 0, -3], [0, 0, -0.4]]), np.array([1, 0, 0], np.uint8)
+    distance, index, near = Lattice(voxels).voted(points, labels, 9.0, 2.0)
+    assert (index.tolist(), near.tolist()) == ([0, 2], [False, True])
+    np.testing.assert_allclose(distance, [3.0, 1.16**0.5])
+    assert _voted(voxels, labels, points, 9.0, most=0.3) == [0, 0]
+
+
 def test_each_vote_is_of_its_own_labels():
     """Of a lattice that has voted before, with labels that all agreed where these do not."""
     voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
     point = voxel_centres([[30.4, 20, 20]])
     lattice = Lattice(voxels)
     alike, mixed = np.zeros(4, np.uint8), np.array([2, 5, 5, 5], dtype=np.uint8)
-    assert [lattice.vote(point, labels, 1.0).tolist() for labels in (alike, mixed, alike)] == [
-        [0], [1], [0],
-    ]  # fmt: skip
+    assert [
+        lattice.voted(point, labels, 1.0, 2.0)[1].tolist() for labels in (alike, mixed, alike)
+    ] == [[0], [1], [0]]
 
 
 def test_of_a_drawn_vote_the_lower_label_wins():
     voxels = np.array([[31, 20, 20], [29, 20, 20]], dtype=np.uint8)
     point = voxel_centres([[30, 20, 20]])
     for labels, winner in (([4, 3], 1), ([3, 4], 0), ([3, 3], 0)):
-        assert Lattice(voxels).vote(point, np.array(labels, np.uint8), 0.7).tolist() == [winner]
+        assert _voted(voxels, np.array(labels, np.uint8), point, 0.7) == [winner]
 
 
 @settings(max_examples=25)
@@ -130,13 +143,14 @@ def test_votes_are_those_of_a_plain_count(seed, width):
     voxels = np.unique(rng.integers(20, 26, (80, 3)), axis=0).astype(np.uint8)
     labels = rng.integers(0, 7, len(voxels)).astype(np.uint8)
     points = voxel_centres(rng.integers(19, 27, (20, 3))) + rng.uniform(-0.5, 0.5, (20, 3)) / 64
-    spokesmen = Lattice(voxels).vote(points, labels, width)
-    for point, spokesman in zip(points, spokesmen, strict=True):
+    distances, spokesmen, _ = Lattice(voxels).voted(points, labels, width, np.inf)
+    for point, spokesman, distance in zip(points, spokesmen, distances, strict=True):
         index = (point + 0.5) * 64 - 0.5
         around = np.abs(voxels - np.rint(index)).max(axis=1) <= 1
         square = ((voxels - index) ** 2).sum(axis=1)
+        assert distance == pytest.approx(square[spokesman] ** 0.5)
         if not around.any():
-            assert spokesman == -1
+            assert square[spokesman] == pytest.approx(square.min())
             continue
         weights = np.zeros(7)
         np.add.at(weights, labels[around], np.exp(-0.5 * square[around] / width**2))
