@@ -76,8 +76,13 @@ def predict(
 
     is_image = source.suffix.lower() in _IMAGES
     require_torch(device or "cpu")
+    import torch
+
     if device is None:
-        device = _default_device(output, is_image)
+        # TRELLIS needs a GPU.
+        device = "cuda" if is_image and torch.cuda.is_available() else "cpu"
+        if is_image:
+            output.note(f"TRELLIS and the decoder run on {device}")
     from slatprep.learn import predict as work
     from slatprep.learn.published import SECONDS, SECONDS_OF_OTHERS
 
@@ -165,17 +170,6 @@ def _draw(output: Output, source: Place, out: Path, seed: int, device: str) -> _
         raise result
     output.note(f"latents: {extractions[0].slat}{', drawn before' if result.kept else ''}")
     return _Image(extractions[0].slat, session, result.seconds)
-
-
-def _default_device(output: Output, is_image: bool) -> Literal["cpu", "cuda"]:
-    """Return the GPU for an image if there is one, since TRELLIS needs it, and say so."""
-    import torch
-
-    if not is_image:
-        return "cpu"
-    device: Literal["cpu", "cuda"] = "cuda" if torch.cuda.is_available() else "cpu"
-    output.note(f"TRELLIS and the decoder run on {device}")
-    return device
 
 
 def _write_gaussians(output: Output, image: _Image, out: Path, path: Path, far: Any) -> None:

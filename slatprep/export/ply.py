@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import StoreError
-from slatprep.export.formats import Exported, ExportOptions, Frame, Points, Writer, annotated_points
+from slatprep.export.formats import (
+    Exported,
+    ExportOptions,
+    Frame,
+    Points,
+    Writer,
+    annotated_points,
+)
 from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.arrays import write_ply
 from slatprep.storage.files import file_name
@@ -34,6 +41,11 @@ VERTEX = np.dtype(
 
 UNITS = "density kg/m^3, E Pa, nu 1"
 """The units, a comment in every PLY written here."""
+
+COLOURS = np.zeros((256, 3), dtype=np.uint8)
+"""Red, green and blue of every material id."""
+for _material, _colour in MATERIAL_COLOURS.items():
+    COLOURS[_material] = tuple(bytes.fromhex(_colour[1:]))
 
 _COMMENTS = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",
@@ -115,9 +127,8 @@ def write_points(
     vertices = np.zeros(len(material), dtype=layout)
     for axis, name in enumerate("xyz"):
         vertices[name] = positions[:, axis]
-    colours = _colours()
     for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[material, channel]
+        vertices[name] = COLOURS[material, channel]
     vertices["alpha"] = 255
     vertices["E"], vertices["density"], vertices["nu"] = properties.T
     vertices["material_id"] = vertices["part_label"] = material
@@ -169,11 +180,3 @@ def to_world(points: ArrayLike, bounds: ArrayLike) -> NDArray[np.float64]:
     index = (np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5
     world: NDArray[np.float64] = lo + index * (hi - lo) / (RESOLUTION - 1)
     return world
-
-
-def _colours() -> NDArray[np.uint8]:
-    """Return the red, green and blue of every material id, (256, 3)."""
-    colours = np.zeros((256, 3), dtype=np.uint8)
-    for material, colour in MATERIAL_COLOURS.items():
-        colours[material] = tuple(bytes.fromhex(colour[1:]))
-    return colours

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
 from slatprep.export import formats
-from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
+from slatprep.export.ply import COLOURS
+from slatprep.records import MATERIAL_CLASSES, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
@@ -143,10 +144,9 @@ def _write_asset(
         prim.CreateAttribute("physics:masses", sdf.ValueTypeNames.FloatArray, custom=False).Set(
             masses
         )
-        colours = np.array([_colour(number) for number in binned.material], np.float32)
-        points.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(
-            vt.Vec3fArray.FromNumpy(colours[binned.rows])
-        )
+        colours = (COLOURS[binned.material[binned.rows]] / 255).astype(np.float32)
+        shown = points.CreateDisplayColorPrimvar(geom.Tokens.vertex)
+        shown.Set(vt.Vec3fArray.FromNumpy(colours))
         binding = shade.MaterialBindingAPI.Apply(prim)
         for number, material in enumerate(binned.material):
             _add_material(stage, binding, number, int(material), solid, binned)
@@ -221,10 +221,6 @@ def _edge(asset: StoredAsset, points: formats.Points) -> float:
         return 1.0 / asset.store.contents.latents.resolution
     scale = float(np.cbrt(np.abs(np.linalg.det(asset.transform[:3, :3]))))
     return scale / RESOLUTION
-
-
-def _colour(material: int) -> tuple[float, ...]:
-    return tuple(byte / 255 for byte in bytes.fromhex(MATERIAL_COLOURS[material][1:]))
 
 
 def _remarks(entries: Sequence[dict[str, Any]]) -> tuple[str, ...]:

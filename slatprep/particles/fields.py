@@ -83,8 +83,8 @@ def stored_field(store: Store, name: str | int, points: Points = "slat") -> Voxe
     else:
         valid = asset.valid
         values = asset.properties_si[valid][:, columns]
-        side = store.contents.latents.resolution
-        field = _on_cells(asset.coords[valid], asset.material[valid], values, side)
+        cells, row = shown_in_cells(asset.coords[valid], store.contents.latents.resolution)
+        field = VoxelField(cells, asset.material[valid][row], values[row])
     if len(field.voxels) == 0:
         raise ConfigError(
             f"{store.path}: no voxel of {asset.asset_id} has a material; expected an asset whose "
@@ -108,7 +108,11 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
         raise InputError(path, f"has a grid of {side}^3", f"2 to {MAX_LATENT_RESOLUTION} a side")
     coords = check_coords(arrays["coords"], path, side)
     material = arrays["material"]
-    _check_columns(path, data)
+    named = npz_small_arrays(data, path, ArraySpec(shapes=(), kinds="U"))[0].get("columns")
+    if named is not None and tuple(named.tolist()) != PROPERTY_COLUMNS:
+        raise InputError(  # Solvers need these.
+            path, f"predicts {', '.join(map(str, named.ravel()))}", ", ".join(PROPERTY_COLUMNS)
+        )
     values = arrays.get("properties_si")
     if values is None:
         values = npz_arrays(data, path, {"properties": _PROPERTIES})["properties"]
@@ -127,43 +131,14 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
             f"{np.count_nonzero(valid)} of {len(valid)} valid",
             "as many of each, and at least one valid voxel",
         )
-    _check_values(path, material, values, valid)
-    return _on_cells(
-        coords[valid], material[valid].astype(np.uint8), values[valid].astype(np.float32), side
-    )
-
-
-def _on_cells(
-    coords: NDArray[np.uint8],
-    material: NDArray[np.uint8],
-    properties: NDArray[np.float32],
-    side: int,
-) -> VoxelField:
-    """Return the materials of SLAT voxels of a grid, on the 64^3 grid of the frame."""
-    cells, row = shown_in_cells(coords, side)
-    return VoxelField(cells, material[row], properties[row])
-
-
-def _check_columns(path: Path, data: bytes) -> None:
-    """Refuse a prediction of other properties than PixieVerse's, which solvers need."""
-    named = npz_small_arrays(data, path, ArraySpec(shapes=(), kinds="U"))[0].get("columns")
-    if named is not None and tuple(named.tolist()) != PROPERTY_COLUMNS:
-        raise InputError(
-            path, f"predicts {', '.join(map(str, named.ravel()))}", ", ".join(PROPERTY_COLUMNS)
-        )
-
-
-def _check_values(
-    path: Path,
-    material: NDArray[np.integer],
-    values: NDArray[np.floating],
-    valid: NDArray[np.bool_],
-) -> None:
     wrong = valid & ((material < 0) | (material >= BACKGROUND) | ~np.isfinite(values).all(axis=1))
     if wrong.any():
-        row = int(np.argmax(wrong))
+        first = int(np.argmax(wrong))
         raise InputError(
             path,
-            f"row {row} has material {material[row]} and properties {values[row].tolist()}",
+            f"row {first} has material {material[first]} and properties {values[first].tolist()}",
             "material 0..6 and finite properties in every valid row",
         )
+    cells, row = shown_in_cells(coords[valid], side)
+    material, values = material[valid].astype(np.uint8), values[valid].astype(np.float32)
+    return VoxelField(cells, material[row], values[row])

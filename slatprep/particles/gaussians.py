@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
+from slatprep.export.ply import COLOURS
 from slatprep.particles.read import SAVED_AXES, Axes
-from slatprep.records import MATERIAL_COLOURS
 from slatprep.storage.arrays import write_ply
 
 _NEAREST = 8
@@ -106,10 +106,7 @@ def gaussians_of(
     made = np.zeros(len(positions), dtype=[(name, "<f4") for name in _FIELDS])
     for axis, values in zip("xyz", positions.T, strict=True):
         made[axis] = values
-    colours = np.array(
-        [list(bytes.fromhex(MATERIAL_COLOURS[number][1:])) for number in range(8)], np.float64
-    )
-    for name, values in zip(_COLOUR, colours[material].T / 255, strict=True):
+    for name, values in zip(_COLOUR, COLOURS[material].T / 255, strict=True):
         made[name] = (values - 0.5) / _SH
     made["opacity"], made["rot_0"] = 6.0, 1.0
     for name in _SCALE:

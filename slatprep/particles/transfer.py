@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import ConfigError
+from slatprep.export import target
+from slatprep.export.ply import UNITS, VERTEX, write_points
+from slatprep.geometry.voxels import filled, occupancy_of
 from slatprep.particles.fields import VoxelField
 from slatprep.particles.read import FRAMES, Axes, Particles
 from slatprep.records import BACKGROUND, RESOLUTION
@@ -169,8 +172,6 @@ def doubt_axes(
 
 def _enclosed(field: VoxelField, points: NDArray[np.float64]) -> float:
     """Return the share of points in the SLAT frame that the field's voxels enclose."""
-    from slatprep.geometry.voxels import filled, occupancy_of
-
     voxels = np.floor((field.locate(points) + 0.5) * RESOLUTION).astype(int)
     there = ((voxels >= 0) & (voxels < RESOLUTION)).all(axis=1)
     solid = filled(occupancy_of(field.voxels))
@@ -185,11 +186,13 @@ def write_transferred(
     Gaussians keep their attributes, behind Pixie's fields. ``conf`` falls to 0 at `max_distance`
     voxels. ConfigError if another file is at `path`.
     """
-    from slatprep.export import target
-    from slatprep.export.ply import write_points
-
     frame = FRAMES["slat" if in_slat else particles.axes]
     positions = particles.in_slat() if in_slat else particles.positions
+    held, more = particles.vertices, {}
+    if held is not None:
+        names = [name for name in held.dtype.names or () if name not in (VERTEX.names or ())]
+        kept = (name for name in names if held.dtype[name].kind in "fiu")
+        more = {(name, ""): held[name][result.rows] for name in kept}
     with target.file(path, _is_material_ply) as new:
         write_points(
             new,
@@ -198,25 +201,10 @@ def write_transferred(
             result.properties,
             np.clip(1.0 - result.distance / max_distance, 0.0, 1.0),
             frame,
-            attributes_of(particles, result.rows),
+            more,
         )
 
 
-def attributes_of(
-    particles: Particles, rows: NDArray[np.intp]
-) -> dict[tuple[str, str], NDArray[np.float32]]:
-    """Return the attributes of Gaussians' rows that Pixie's fields lack, by name and unit."""
-    from slatprep.export.ply import VERTEX
-
-    if particles.vertices is None:
-        return {}
-    held = particles.vertices
-    names = [name for name in held.dtype.names or () if name not in (VERTEX.names or ())]
-    return {(name, ""): held[name][rows] for name in names if held.dtype[name].kind in "fiu"}
-
-
 def _is_material_ply(path: Path) -> bool:
-    from slatprep.export.ply import UNITS
-
     with path.open("rb") as stream:
         return UNITS.encode() in stream.read(1024)
