@@ -59,7 +59,7 @@ TESTS = {
     "judge/witness": ["judge/test_witness_sums.py", "judge/test_witness.py"],
     "normalize": ["test_normalize.py"],
     "geometry/frames": ["geometry"],
-    "geometry/voxels": ["geometry/test_voxel_sets.py", "geometry/test_frames.py"],
+    "geometry/voxels": ["geometry/test_frames.py"],
     "geometry/nearest": ["geometry/test_nearest.py"],
     "geometry/fill": ["geometry/test_distance.py"],
     "geometry/distance": ["geometry/test_distance.py"],

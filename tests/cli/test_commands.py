@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from support.commands import document, refused, run
+from support.commands import document, parse_command, refused, run
 from support.trees import tree
 
 from slatprep.cli.commands import COMMANDS
@@ -39,7 +39,7 @@ def ids_of(store: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_has_an_example_that_parses(name, parse_command):
+def test_help_has_an_example_that_parses(name):
     output = run(name, "--help").output
     examples = re.findall(r"^ +(slatprep .+)$", output.partition("Example:")[2], re.M)
     assert examples

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import get_type_hints
 
 import pytest
+from support.commands import parse_command
 
 from slatprep.cli.export import export
 from slatprep.export import FORMATS
@@ -36,7 +37,7 @@ TARGETS_SHOWN = [(page, line) for page, line in code_lines("sh") if line.startsw
 
 
 @pytest.mark.parametrize(("page", "line"), COMMANDS_SHOWN)
-def test_command_shown_parses(page, line, parse_command):
+def test_command_shown_parses(page, line):
     parse_command(line)
 
 

@@ -76,18 +76,12 @@ def test_against_a_plain_computation(learn_store, predicted, form):
     by_object: dict[str, list[list[float]]] = {}
     with h5py.File(predicted["hdf5"]) as file:
         for k, asset_id in enumerate(np.asarray(root["asset/id"])):
-            properties = file[f"{asset_id}/properties"][:].tolist()
-            logits = file[f"{asset_id}/logits"][:].tolist()
-            sums, right, count = [0.0, 0.0, 0.0], 0, 0
-            for local, row in enumerate(range(offset[k], offset[k + 1])):
-                if valid[row]:
-                    for axis in range(3):
-                        sums[axis] += (properties[local][axis] - float(truth[row, axis])) ** 2
-                    right += logits[local].index(max(logits[local])) == material[row]
-                    count += 1
-            means = [total / count for total in sums]
-            views = by_object.setdefault(str(objects[k]), [])
-            views.append([*means, sum(means) / 3, right / count])
+            here = slice(offset[k], offset[k + 1])
+            squares = (file[f"{asset_id}/properties"][:] - truth[here]) ** 2
+            right = file[f"{asset_id}/logits"][:].argmax(axis=1) == material[here]
+            means = squares[valid[here]].mean(axis=0)
+            row = [*means, means.mean(), right[valid[here]].mean()]
+            by_object.setdefault(str(objects[k]), []).append(row)
     rows = [np.mean(views, axis=0) for views in by_object.values()]
     result = evaluate_store(predicted[form], learn_store, None, spread="se")
     assert result.overall.objects == 8

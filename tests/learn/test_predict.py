@@ -8,13 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
 import pytest
 import torch
 import zarr
-from PIL.Image import Image
+from PIL import Image
+from plyfile import PlyData, PlyElement
 from support import commands
 from support.commands import document, refused
 from support.made_store import make_store
@@ -196,76 +198,46 @@ def test_ranges_of_a_prediction_are_checked_and_equal_ones_change_nothing():
             check_prediction("p", {"properties": values, "ranges": wrong}, coords, PIXIE_RANGES)
 
 
-class Pipeline:
-    """What is used of TRELLIS's image pipeline; its Gaussians lie at the voxels' centres."""
+@pytest.fixture
+def trellis(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """TRELLIS's interface in place of TRELLIS; its Gaussians lie at the voxels' centres."""
+    latents, stated = random_latents(9), ("sparse_structure_sampler", "slat_sampler")
+    pipeline = Mock(device="cpu", shift=0.0, slat_normalization={})
+    pipeline.configure_mock(**{f"{name}_params": {} for name in stated})
+    pipeline.preprocess_image.side_effect = lambda image: image
+    coords = torch.from_numpy(np.insert(latents.coords.astype(np.int32), 0, 0, axis=1))
+    pipeline.sample_slat.return_value = SimpleNamespace(
+        coords=coords, feats=torch.from_numpy(latents.feats)
+    )
 
-    device = "cpu"
-    shift = np.zeros(3)
-
-    def __init__(self) -> None:
-        self.sparse_structure_sampler_params: dict[str, object] = {}
-        self.slat_sampler_params: dict[str, object] = {}
-        self.slat_normalization: dict[str, object] = {}
-
-    def preprocess_image(self, input: Image) -> Image:
-        return input
-
-    def get_cond(self, image: list[Image]) -> dict[str, object]:
-        return {}
-
-    def sample_sparse_structure(
-        self, cond: object, num_samples: int = 1, sampler_params: object = None
-    ) -> torch.Tensor:
-        return torch.from_numpy(np.insert(random_latents(9).coords.astype(np.int32), 0, 0, axis=1))
-
-    def sample_slat(
-        self, cond: object, coords: torch.Tensor, sampler_params: object = None
-    ) -> SimpleNamespace:
-        return SimpleNamespace(coords=coords, feats=torch.from_numpy(random_latents(9).feats))
-
-    def decode_slat(self, slat: Any, formats: list[str]) -> dict[str, list[Any]]:
+    def decode_slat(slat: Any, formats: list[str]) -> dict[str, list[Any]]:
         assert formats == ["gaussian"]
         x, y, z = ((slat.coords[:, 1:].numpy() + 0.5) / 64 - 0.5).T
-        self.feats = slat.feats.numpy()
-        x[0] += self.shift[0]
+        pipeline.feats = slat.feats.numpy()
+        x[0] += pipeline.shift
         names = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "opacity", "scale_0", "rot_0")
         rows = np.zeros(len(x), [(name, "f4") for name in names])
         rows["x"], rows["y"], rows["z"] = x, -z, y  # as TRELLIS's save_ply turns them
+        element = PlyElement.describe(rows, "vertex")
+        return {"gaussian": [SimpleNamespace(save_ply=PlyData([element]).write)]}
 
-        def save_ply(path: str) -> None:
-            from plyfile import PlyData, PlyElement
-
-            PlyData([PlyElement.describe(rows, "vertex")]).write(path)
-
-        return {"gaussian": [SimpleNamespace(save_ply=save_ply)]}
-
-
-@pytest.fixture
-def trellis(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
-    """TRELLIS's interface in place of TRELLIS."""
-    pipeline = Pipeline()
+    pipeline.decode_slat = decode_slat
     sparse = SimpleNamespace(SparseTensor=lambda feats, coords: SimpleNamespace(**locals()))
-    monkeypatch.setitem(sys.modules, "trellis", ModuleType("trellis"))
-    monkeypatch.setitem(sys.modules, "trellis.modules", ModuleType("trellis.modules"))
+    for name in ("trellis", "trellis.modules"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
     monkeypatch.setitem(sys.modules, "trellis.modules.sparse", sparse)
-    monkeypatch.setattr(
-        "slatprep.extract.load_session",
-        lambda *_, **__: Session(pipeline, torch, {"name": "m", "revision": "r"}),
-    )
+    session = Session(pipeline, torch, {"name": "m", "revision": "r"})
+    monkeypatch.setattr("slatprep.extract.load_session", lambda *_, **__: session)
     return pipeline
 
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
-    import PIL.Image
-
-    PIL.Image.new("RGB", (8, 8)).save(tmp_path / "cup.png")
+    Image.new("RGB", (8, 8)).save(tmp_path / "cup.png")
     return tmp_path / "cup.png"
 
 
 def test_an_image_becomes_gaussians_with_materials(checkpoint, tmp_path, trellis, image):
-    from plyfile import PlyData
-
     out, ply = tmp_path / "out", tmp_path / "cup.ply"
     words = (image, "--checkpoint", checkpoint, "--out", out, "--gaussians", ply)
     stages = ["image", "sparse structure", "SLAT", "read", "decode", "write", "gaussians"]
@@ -287,9 +259,7 @@ def test_an_image_becomes_gaussians_with_materials(checkpoint, tmp_path, trellis
 def test_far_gaussians_of_an_image_are_what_far_says(
     far, kept, checkpoint, tmp_path, trellis, image
 ):
-    from plyfile import PlyData
-
-    trellis.shift = np.array([9.0, 0.0, 0.0])
+    trellis.shift = 9.0
     ply = tmp_path / "cup.ply"
     words = (image, "--checkpoint", checkpoint, "--out", tmp_path / "out", "--gaussians", ply)
     result = step("predict", *words, "--far", far)

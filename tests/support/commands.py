@@ -1,8 +1,10 @@
 """Commands in this process, as a user types them."""
 
 import json
+import shlex
 from typing import Any
 
+import click
 from click.testing import CliRunner, Result
 
 from slatprep.cli.commands import slatprep
@@ -25,3 +27,14 @@ def refused(*words: object, code: int = 2) -> str:
 def document(*words: object, code: int = 0) -> Any:
     """Return what a command prints as JSON."""
     return json.loads(run(*words, "--json", code=code).stdout)
+
+
+def parse_command(line: str) -> None:
+    """Fail where a `slatprep` command line is not one."""
+    program, name, *words = shlex.split(line)
+    command = slatprep.get_command(click.Context(slatprep), name)
+    assert program == "slatprep" and command is not None, f"no such command: {line}"
+    given, rest, _ = command.make_parser(click.Context(command)).parse_args(words)
+    assert rest == [], line
+    for parameter in command.params:
+        assert not parameter.required or given.get(parameter.name or ""), line

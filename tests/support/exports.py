@@ -26,6 +26,6 @@ def hold_truth(
     """Hold the values of an asset of `support.synthetic`, by class, to those of its two stuffs."""
     assert set(np.unique(material)) == {JELLY[0], METAL[0]}
     for number, *values in (JELLY, METAL):
-        here = material == number
+        here = np.asarray(material) == number
         for column, value in zip((modulus, density, ratio), values, strict=True):
             np.testing.assert_allclose(column[here], value, rtol=1e-4)
