@@ -18,7 +18,6 @@ import pytest
 import zarr
 from click.testing import Result
 from support import commands
-from support.commands import run
 from support.published_hub import PublishedHub
 from support.trees import tree
 
