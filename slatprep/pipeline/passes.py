@@ -40,11 +40,9 @@ from slatprep.records import (
     Consensus,
     Judgement,
     LatentChoice,
-    MaterialField,
-    StructuredLatents,
     Verdict,
 )
-from slatprep.store.record import AssetRecord, FailedRecord, FirstPass
+from slatprep.store.record import FirstPass
 from slatprep.store.record_json import to_json
 from slatprep.workers.local import run_unordered
 
@@ -65,14 +63,9 @@ class Reopened:
     """A finished asset, read back from the spool."""
 
     def __init__(self, asset: Row, spool: Spool) -> None:
-        record = spool.record(asset.key)
-        if isinstance(record, FailedRecord):
-            raise TypeError(f"{record.asset_id}: an asset that failed is not judged anew")
         self._asset, self._spool = asset, spool
-        self.record: AssetRecord = record
-        self.latents: StructuredLatents = spool.latents(asset.key)
-        self.annotation: Annotation = spool.annotation(asset.key)
-        self.field: MaterialField = spool.field(asset.key)
+        self.record, self.field = spool.record(asset.key), spool.field(asset.key)
+        self.latents, self.annotation = spool.latents(asset.key), spool.annotation(asset.key)
 
     def placed(
         self, alignment: Alignment, parameters: BuildParameters
@@ -102,21 +95,15 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
 
     The order stays; rows without a tie are the same objects.
     """
-    consensus = find_consensus(
-        asset.columns["transform"]
-        for asset in assets
-        if not asset.columns["n_placements"] and asset.columns["verdict"] != Verdict.FAILED
-    )
     tied = [asset for asset in assets if asset.columns["n_placements"]]
+    others = [asset for asset in assets if not asset.columns["n_placements"]]
+    consensus = find_consensus(
+        asset.columns["transform"] for asset in others if asset.columns["verdict"] != Verdict.FAILED
+    )
     if consensus is None:
         crew.tell(f"consensus: too few assets share a rotation; {len(tied):,} tied ones stay")
         return assets
-    turned = [
-        asset
-        for asset in assets
-        if not asset.columns["n_placements"]
-        and not is_common(asset.columns["transform"], consensus)
-    ]
+    turned = [one for one in others if not is_common(one.columns["transform"], consensus)]
     tasks = ((asset, context.spool, consensus, context.parameters) for asset in (*tied, *turned))
     settled = run_unordered(settle_asset, tasks, crew.of(len(assets)))
     changed = {asset.asset_id: asset for asset in settled}
@@ -170,14 +157,12 @@ def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: 
     evidence = dict(run_unordered(weigh_asset, tasks, jobs))
     reliability = reliability_of([evidence[asset.asset_id] for asset in sure])
     choices = {asset.asset_id: choice_of(evidence[asset.asset_id], reliability) for asset in assets}
-    tasks_of_changed = (
+    doubted = [
         (asset, spool, choices[asset.asset_id], reliability, model_of[asset.asset_id], parameters)
         for asset in assets
         if choices[asset.asset_id] or evidence[asset.asset_id].gain < reliability.least_gain
-    )
-    changed = {
-        asset.asset_id: asset for asset in run_unordered(apply_latents, tasks_of_changed, jobs)
-    }
+    ]
+    changed = {asset.asset_id: asset for asset in run_unordered(apply_latents, doubted, jobs)}
     contradictions = sum(bool(asset.columns["contradicted"]) for asset in changed.values())
     crew.tell(_told(reliability, choices.values(), contradictions))
     return [changed.get(asset.asset_id, asset) for asset in assets]
@@ -194,14 +179,8 @@ def weigh_asset(
 ) -> tuple[str, LatentEvidence]:
     """Return an asset's id and what its latents say of its labels."""
     first = Reopened(asset, spool)
-    return asset.asset_id, weigh(
-        first.field,
-        first.latents,
-        first.record.alignment,
-        first.annotation.material,
-        model,
-        parameters.sample,
-    )
+    placed = first.field, first.latents, first.record.alignment, first.annotation.material
+    return asset.asset_id, weigh(*placed, model, parameters.sample)
 
 
 def apply_latents(
@@ -219,11 +198,9 @@ def apply_latents(
     if choice is not None:
         number, by = choice
         # Placement 0 is the one that the asset has: it stands, and is settled now.
-        chosen = (
-            take(alignment, number - 1, first.latents, by)
-            if number
-            else replace(alignment, settled_by=by)
-        )
+        chosen = replace(alignment, settled_by=by)
+        if number:
+            chosen = take(alignment, number - 1, first.latents, by)
         alignment, annotation, judgement = first.placed(chosen, parameters)
     if model.gain(first.latents.feats, annotation.material) < reliability.least_gain:
         judgement = contradicted(judgement)

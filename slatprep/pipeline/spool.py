@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +36,12 @@ from slatprep.storage.atomic import staged_apart, writing
 from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, is_spooled
-from slatprep.store.layout import MERGED_COLUMNS
-from slatprep.store.record import AssetRecord, FailedRecord, Record
-from slatprep.store.record_json import columns_of, digest_of, read_record, to_json
+from slatprep.store.record import AssetRecord
+from slatprep.store.record_json import columns_of, digest_of, read_asset_record, to_json
 
 Arrays = dict[str, NDArray[Any]]
 
-_VOXEL_ARRAYS = ("coords", "feats", "properties", "material", "valid", "distance", "place",
-                 "confidence")  # fmt: skip
+_ANNOTATION = tuple(field.name for field in fields(Annotation))
 _TORN = (OSError, ValueError, KeyError, StoreError)
 
 
@@ -74,9 +73,7 @@ class Spool:
         if self.arrays:
             arrays |= {name: getattr(latents, name) for name in ("coords", "feats")}
             arrays["slat_resolution"] = np.array(latents.resolution)
-            arrays |= {name: getattr(annotation, name) for name in _VOXEL_ARRAYS[2:]}
-            if annotation.spread is not None and annotation.votes is not None:
-                arrays |= {"spread": annotation.spread, "votes": annotation.votes}
+            arrays |= {name: own for name, own in vars(annotation).items() if own is not None}
             arrays |= {
                 "grid_occupancy": np.packbits(field.occupancy),
                 "grid_voxels": field.voxels,
@@ -96,11 +93,11 @@ class Spool:
             with self._open(key) as file:
                 arrays = dict(file)  # Reads, so checks, them all.
             text = arrays["record"].tobytes()
-            record = read_record(text, str(self._path(key)))
+            record = read_asset_record(text, str(self._path(key)))
             extent = arrays["extent"]
         except _TORN:
             return None
-        if isinstance(record, FailedRecord) or (self.arrays and "coords" not in arrays):
+        if self.arrays and "coords" not in arrays:
             return None  # Finished by an alignment without a store.
         return record, row_of(record, text, extent)
 
@@ -132,9 +129,9 @@ class Spool:
         storage.remove(n for n in ours if n not in kept and (n == mark or not others))
         return others
 
-    def record(self, key: str) -> Record:
+    def record(self, key: str) -> AssetRecord:
         """Read an asset's record back."""
-        return read_record(self.record_text(key), str(self._path(key)))
+        return read_asset_record(self.record_text(key), str(self._path(key)))
 
     def record_text(self, key: str) -> bytes:
         """Read an asset's record back as its JSON, unchecked."""
@@ -145,7 +142,7 @@ class Spool:
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""
         with self._open(key) as arrays:
-            there = (name for name in (*_VOXEL_ARRAYS, *MERGED_COLUMNS) if name in arrays)
+            there = (name for name in ("coords", "feats", *_ANNOTATION) if name in arrays)
             return {name: arrays[name] for name in there}
 
     def latents(self, key: str) -> StructuredLatents:
@@ -157,8 +154,7 @@ class Spool:
     def annotation(self, key: str) -> Annotation:
         """Read what was looked up at an asset's voxels, properties in SI units."""
         with self._open(key) as arrays:
-            there = (name for name in (*_VOXEL_ARRAYS[2:], *MERGED_COLUMNS) if name in arrays)
-            return Annotation(**{name: arrays[name] for name in there})
+            return Annotation(**{name: arrays[name] for name in _ANNOTATION if name in arrays})
 
     def field(self, key: str) -> MaterialField:
         """Read an asset's PixieVerse field, without its sources."""
