@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from slatprep.geometry.frames import split_transform
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import canvas
-from slatprep.inspect.pictures.canvas import draw_image, draw_legend, new_figure, size_of, write
 from slatprep.inspect.pictures.scene import (
     FARTHEST,
     Deformed,
@@ -107,7 +106,7 @@ def draw_alignment(
         best = max(alignment.open_placements, key=lambda placement: placement.score)
         scene = replace(scene, tied=best.transform)
     further = len(columns_of(scene)) - len(COLUMNS)
-    figure = new_figure(WIDTH + further * (PANEL + _GAP), HEIGHT)
+    figure = canvas.new_figure(WIDTH + further * (PANEL + _GAP), HEIGHT)
     reasons = _head(figure, check, title, subtitle)
     _panels(figure, scene, finer)
     _legend(figure, scene)
@@ -177,24 +176,20 @@ def _outline(drawing: Drawing) -> NDArray[np.float64]:
 def _panels(figure: Figure, scene: Scene, finer: int) -> None:
     for column, (name, meaning) in enumerate(columns_of(scene)):
         x = _LEFT + column * (PANEL + _GAP)
-        write(figure, x, _TOP - 30, name, weight="bold", size=9)
-        write(figure, x, _TOP - 10, meaning, color=canvas.MUTED, size=6.8)
+        canvas.write(figure, x, _TOP - 30, name, weight="bold", size=9)
+        canvas.write(figure, x, _TOP - 10, meaning, color=canvas.MUTED, size=6.8)
     for row, view in enumerate(views(scene, finer * PANEL)):
         y = _TOP + row * (PANEL + _GAP)
         for column, image in enumerate(panels(scene, view)):
-            draw_image(figure, _LEFT + column * (PANEL + _GAP), y, image, finer)
+            canvas.draw_image(figure, _LEFT + column * (PANEL + _GAP), y, image, finer)
         _axes_triad(figure, view, _LEFT + 6, y + PANEL - 34)
 
 
 def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
-    from matplotlib.lines import Line2D
-
-    width, height = size_of(figure)
     for k, name in enumerate("xyz"):
         dx, dy = 20 * view.rotation[:2, k]
-        line = [(x + 12) / width, (x + 12 + dx) / width], [1 - y / height, 1 - (y - dy) / height]
-        figure.add_artist(Line2D(*line, color=canvas.MUTED, linewidth=0.8))
-        write(
+        canvas.draw_line(figure, x + 12, y, (x + 12 + dx, y - dy), canvas.MUTED)
+        canvas.write(
             figure, x + 12 + 1.45 * dx, y - 1.45 * dy, name, size=6, color=canvas.MUTED,
             ha="center", va="center_baseline",
         )  # fmt: skip
@@ -203,9 +198,9 @@ def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
 def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> int:
     """Write title, verdict and reasons; return the height of the last reason."""
     colour, bold = canvas.VERDICT_COLOURS[check.verdict], {"weight": "bold", "size": 13}
-    write(figure, _LEFT, 50, title, **bold)
-    write(figure, _LEFT, 76, subtitle, size=7.5, color=canvas.MUTED)
-    write(figure, _side_of(figure), 50, f"alignment {check.verdict}", color=colour, **bold)
+    canvas.write(figure, _LEFT, 50, title, **bold)
+    canvas.write(figure, _LEFT, 76, subtitle, size=7.5, color=canvas.MUTED)
+    canvas.write(figure, _side_of(figure), 50, f"alignment {check.verdict}", color=colour, **bold)
     reasons = list(check.words)
     if not check.consistent:
         reasons.append("the store's figures do not all agree with its voxels")
@@ -213,7 +208,7 @@ def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> i
     if len(lines) > _MOST_LINES:
         lines = [*lines[: _MOST_LINES - 1], "and more: `slatprep check-alignment` prints all"]
     for number, line in enumerate(lines):
-        write(figure, _side_of(figure), 74 + 17 * number, line, size=7, color=canvas.MUTED)
+        canvas.write(figure, _side_of(figure), 74 + 17 * number, line, size=7, color=canvas.MUTED)
     return 74 + 17 * (len(lines) - 1)
 
 
@@ -228,8 +223,10 @@ def _legend(figure: Figure, scene: Scene) -> None:
     columns = 4 if scene.deformed is None else 3  # The fourth is above the scale.
     end = _LEFT + columns * (PANEL + _GAP) - _GAP
     words = "share of the SLAT voxels"
-    draw_legend(figure, entries, (_LEFT, y, end - 190), edgecolor=canvas.MUTED, linewidth=0.5)
-    write(figure, end, y, words, size=6.8, color=canvas.MUTED, ha="right")
+    canvas.draw_legend(
+        figure, entries, (_LEFT, y, end - 190), edgecolor=canvas.MUTED, linewidth=0.5
+    )
+    canvas.write(figure, end, y, words, size=6.8, color=canvas.MUTED, ha="right")
     if scene.deformed is not None:
         _scale(figure, displacement_scale(scene.deformed), _LEFT + 3 * (PANEL + _GAP), y)
 
@@ -238,16 +235,16 @@ def _scale(figure: Figure, farthest: float, x: int, y: int) -> None:
     """Draw the colour scale of displacements, 0 to `farthest` voxels, below their column."""
     along = np.linspace(0.0, farthest, PANEL)
     bar = np.broadcast_to(distance_colours(along, farthest)[None], (10, PANEL, 3))
-    draw_image(figure, x, y - 9, bar)
+    canvas.draw_image(figure, x, y - 9, bar)
     ends = ((x, "0", "left"), (x + PANEL / 2, f"{farthest / 2:g}", "center"),
             (x + PANEL, f"{farthest:g} voxels", "right"))  # fmt: skip
     for at, words, ha in ends:
-        write(figure, at, y + 17, words, size=6.8, color=canvas.MUTED, ha=ha)
+        canvas.write(figure, at, y + 17, words, size=6.8, color=canvas.MUTED, ha=ha)
 
 
 def _side_of(figure: Figure) -> float:
     """Return the left edge of the column in pixels."""
-    return size_of(figure)[0] - _SIDE_MARGIN - _SIDE_WIDTH
+    return canvas.size_of(figure)[0] - _SIDE_MARGIN - _SIDE_WIDTH
 
 
 def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> float:
@@ -256,46 +253,48 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> f
     columns = (left, left + 275, left + _SIDE_WIDTH)
     for x, name, ha in zip(columns, ("figure", "value", "good"), ("left", "right", "right"),
                            strict=True):  # fmt: skip
-        write(figure, x, y, name, size=6.8, color=canvas.MUTED, ha=ha)
-    _rule(figure, y + 7)
+        canvas.write(figure, x, y, name, size=6.8, color=canvas.MUTED, ha=ha)
+    canvas.draw_line(figure, left, y + 7, (left + _SIDE_WIDTH, y + 7), canvas.RULE)
     rows = [one for name in _SHOWN for one in check.figures if one.name == name]
     for number, one in enumerate(rows):
         line = y + 30 + _LINE * number
         worse = one.passes is False
         colour = canvas.VERDICT_COLOURS["failed"] if worse else canvas.INK
-        write(figure, columns[0], line, _SHOWN[one.name], size=7.5)
+        canvas.write(figure, columns[0], line, _SHOWN[one.name], size=7.5)
         # Adding 0 turns a rounded -0 into 0.
         value = "-" if np.isnan(one.value) else f"{round(one.value, 3) + 0.0:.3f}"
-        write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
+        canvas.write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
         limit = one.threshold_text.replace(">=", "\u2265").replace("<=", "\u2264")
-        write(figure, columns[2] - 26, line, limit, size=7.5, ha="right", color=canvas.MUTED)
+        canvas.write(figure, columns[2] - 26, line, limit, size=7.5, ha="right", color=canvas.MUTED)
         if one.passes is not None:
             mark = "\u2717" if worse else "\u2713"
             good = canvas.VERDICT_COLOURS["failed" if worse else "good"]
-            write(figure, columns[2], line, mark, size=7.5, ha="right", color=good)
+            canvas.write(figure, columns[2], line, mark, size=7.5, ha="right", color=good)
     rotation, shift, scale = split_transform(check.transform)
     angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
     moved = np.linalg.norm(shift) * RESOLUTION
     words = f"turned {angle:.1f}°, shifted {moved:.2f} voxel, scaled {scale:.3f}"
     line = y + 36 + _LINE * len(rows)
-    write(figure, left, line, words, size=7, color=canvas.MUTED)
+    canvas.write(figure, left, line, words, size=7, color=canvas.MUTED)
     if scene.deformed is not None:
         apart = scene.deformed.displacement
         words = f"deformed by {apart.mean():.2f} voxel in the mean, {apart.max():.2f} at most"
         line += 17
-        write(figure, left, line, words, size=7, color=canvas.MUTED)
+        canvas.write(figure, left, line, words, size=7, color=canvas.MUTED)
     return line
 
 
 def _histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
     """Draw the histogram of errors, and as a line that of the errors before."""
-    write(figure, _side_of(figure), y, "error per SLAT surface voxel", weight="bold", size=8.5)
+    canvas.write(
+        figure, _side_of(figure), y, "error per SLAT surface voxel", weight="bold", size=8.5
+    )
     share = float((scene.error <= radius).mean())
     before = "before" if scene.deformed is None else "undeformed"
     words = (
         f"median {np.median(scene.error):.2f} voxel, {share:.1%} within {radius:g}; line: {before}"
     )
-    write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
+    canvas.write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
     axes = _axes(figure, y + 36, 190)
     edges = np.linspace(0, FARTHEST, 31)
     middles = (edges[:-1] + edges[1:]) / 2
@@ -317,14 +316,14 @@ def _histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
 def _candidates(figure: Figure, alignment: Alignment, y: float) -> None:
     """Draw the coarse fitness of each distinct start, the best first."""
     candidates = alignment.candidates
-    write(figure, _side_of(figure), y, "starts of the search", weight="bold", size=8.5)
+    canvas.write(figure, _side_of(figure), y, "starts of the search", weight="bold", size=8.5)
     if not candidates:
         words = "none are recorded"
-        write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
+        canvas.write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
         return
     own = sorted((c for c in candidates if c.same_as is None), key=lambda c: (-c.fitness, c.index))
     words = f"{len(own)} distinct of {len(candidates)}, by coarse fitness"
-    write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
+    canvas.write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
     axes = _axes(figure, y + 36, 190)
     wide = alignment.search is Search.SO3
     colours = [canvas.RULE if wide else canvas.ACCENT] + [canvas.RULE] * (len(own) - 1)
@@ -344,19 +343,8 @@ def _candidates(figure: Figure, alignment: Alignment, y: float) -> None:
 
 
 def _axes(figure: Figure, y: float, height: float) -> Axes:
-    width, whole = size_of(figure)
-    left = _side_of(figure) + 40
-    box = (left / width, 1 - (y + height) / whole, (_SIDE_WIDTH - 40) / width, height / whole)
-    axes = figure.add_axes(box)
+    axes = canvas.add_axes(figure, _side_of(figure) + 40, y, _SIDE_WIDTH - 40, height)
     axes.tick_params(length=2.5, width=0.6)
     for spine in axes.spines.values():
         spine.set_linewidth(0.6)
     return axes
-
-
-def _rule(figure: Figure, y: float) -> None:
-    from matplotlib.lines import Line2D
-
-    width, height = size_of(figure)
-    ends = [_side_of(figure) / width, (_side_of(figure) + _SIDE_WIDTH) / width]
-    figure.add_artist(Line2D(ends, [1 - y / height] * 2, color=canvas.RULE, linewidth=0.8))

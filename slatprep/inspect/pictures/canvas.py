@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 VERDICT_COLOURS = {"good": "#1B7F4B", "doubtful": "#B26A00", "failed": "#B3261E"}
@@ -99,14 +100,34 @@ def write(figure: Figure, x: float, y: float, words: str, **style: Any) -> None:
 def draw_image(figure: Figure, x: int, y: int, image: NDArray[np.float64], finer: int = 1) -> None:
     """Put an image (rows, columns, 3) in 0..1 at a pixel, with `finer` of its pixels to one."""
     pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    width, height = size_of(figure)
     tall, wide = (side / finer for side in image.shape[:2])
     if finer == 1:
-        figure.figimage(pixels, xo=x, yo=round(height - y - tall), origin="upper")
+        below = round(size_of(figure)[1] - y - tall)
+        figure.figimage(pixels, xo=x, yo=below, origin="upper")
         return
-    axes = figure.add_axes((x / width, 1 - (y + tall) / height, wide / width, tall / height))
+    axes = add_axes(figure, x, y, wide, tall)
     axes.imshow(pixels, interpolation="none")
     axes.set_axis_off()
+
+
+def add_axes(figure: Figure, x: float, y: float, wide: float, tall: float) -> Axes:
+    """Return axes that begin at a pixel, and are so wide and tall in pixels."""
+    width, height = size_of(figure)
+    return figure.add_axes((x / width, 1 - (y + tall) / height, wide / width, tall / height))
+
+
+def draw_line(figure: Figure, x: float, y: float, end: tuple[float, float], colour: str) -> None:
+    """Draw a line from one pixel to another."""
+    from matplotlib.lines import Line2D
+
+    width, height = size_of(figure)
+    places = [x / width, end[0] / width], [1 - y / height, 1 - end[1] / height]
+    figure.add_artist(Line2D(*places, color=colour, linewidth=0.8))
+
+
+def cut(words: str, most: int) -> str:
+    """Return words of so many characters at most."""
+    return words if len(words) <= most else f"{words[: most - 1]}…"
 
 
 def draw_legend(

@@ -54,7 +54,7 @@ def draw_statistics(store: Store, statistics: StoreStatistics, kind: str = "png"
                 )
                 top += joint
             bars = [getattr(group, side).classes for group in shown]
-            names = [f"{_cut(group.name)} ({group.slat.assets:,})" for group in shown]
+            names = [f"{canvas.cut(group.name, 14)} ({group.slat.assets:,})" for group in shown]
             names = names if column == 0 else [""] * len(names)
             _bars(_axes(figure, column, top, _BAR * max(len(bars), 1)), names, bars)
         return canvas.in_format(figure, kind)
@@ -82,9 +82,7 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
 
 
 def _axes(figure: Figure, column: int, top: float, tall: float) -> Axes:
-    width, height = canvas.size_of(figure)
-    left = _LEFT + column * (_PLOT + _GAP)
-    return figure.add_axes((left / width, 1 - (top + tall) / height, _PLOT / width, tall / height))
+    return canvas.add_axes(figure, _LEFT + column * (_PLOT + _GAP), top, _PLOT, tall)
 
 
 def _histogram(axes: Axes, histogram: Histogram, side: str) -> None:
@@ -148,10 +146,6 @@ def _label(histogram: Histogram) -> str:
 
 def _percent(share: float) -> str:
     return "-" if np.isnan(share) else f"{share:.2%}"
-
-
-def _cut(name: str) -> str:
-    return name if len(name) <= 14 else f"{name[:13]}…"
 
 
 def draw_errors(errors: MeasuredErrors, name: str, kind: str = "png") -> bytes:

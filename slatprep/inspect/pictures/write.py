@@ -11,7 +11,6 @@ from slatprep.errors import StoreError, amount
 from slatprep.inspect.check import AlignmentCheck, check_alignment
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import draw_alignment, error_picture, outlined
-from slatprep.inspect.pictures.canvas import FORMATS, draw_image, in_format, new_figure, write
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, scene_of, views
 from slatprep.records import Place
 from slatprep.storage.atomic import staged
@@ -53,7 +52,7 @@ def write_pictures(
     cannot be written, or a record cannot be read.
     """
     kind = target.suffix.lower()[1:]
-    alone = len(checks) == 1 and kind in FORMATS
+    alone = len(checks) == 1 and kind in canvas.FORMATS
     shown = {check.asset_id: check for check in checks[:MOST]}
     drawn: dict[str, tuple[Scene, str]] = {}
     files = {
@@ -98,7 +97,7 @@ def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, S
     with canvas.styled():
         finer = 1 if kind == "png" else 2
         figure = draw_alignment(scene, check, title, subtitle_of(asset), alignment, finer)
-        return check.asset_id, in_format(figure, kind), scene, title
+        return check.asset_id, canvas.in_format(figure, kind), scene, title
 
 
 def draw_sheet(
@@ -111,9 +110,9 @@ def draw_sheet(
     height = _HEAD + rows * _CELL_HEIGHT + _MARGIN
 
     with canvas.styled():
-        figure = new_figure(width, height)
-        write(figure, _MARGIN, 46, f"{len(scenes)} alignments", weight="bold", size=12)
-        write(
+        figure = canvas.new_figure(width, height)
+        canvas.write(figure, _MARGIN, 46, f"{len(scenes)} alignments", weight="bold", size=12)
+        canvas.write(
             figure, _MARGIN, 68, "left: PixieVerse voxels by class, SLAT outlined; "
             f"right: error per voxel, pale 0 to dark {FARTHEST:g} voxels",
             size=7, color=canvas.MUTED,
@@ -124,18 +123,18 @@ def draw_sheet(
             view = views(scene, _THUMBNAIL)[0]
             images = *outlined(scene, view, scene.placed), error_picture(scene, view)
             for k, image in enumerate(images):
-                draw_image(figure, x + k * _THUMBNAIL, y, image)
+                canvas.draw_image(figure, x + k * _THUMBNAIL, y, image)
             colour = canvas.VERDICT_COLOURS[check.verdict]
             line = y + _THUMBNAIL + 16
-            write(figure, x, line, _cut(title), size=7.5, weight="bold")
-            write(figure, x + _CELL_WIDTH - _GAP, line, str(check.verdict), size=7.5, weight="bold",
-                 color=colour, ha="right")  # fmt: skip
-            write(figure, x, line + 17, check.asset_id[:40], size=6.5, color=canvas.MUTED)
+            canvas.write(figure, x, line, canvas.cut(title, _TITLE), size=7.5, weight="bold")
+            right = {"size": 7.5, "weight": "bold", "color": colour, "ha": "right"}
+            canvas.write(figure, x + _CELL_WIDTH - _GAP, line, str(check.verdict), **right)
+            canvas.write(figure, x, line + 17, check.asset_id[:40], size=6.5, color=canvas.MUTED)
             worse = min(check.figure("fitness").value, check.figure("fitness_backward").value)
             sure = check.value("confidence")
             words = f"confidence {sure:.3f}   fitness {worse:.3f} (the lower of both ways)"
-            write(figure, x, line + 32, words, size=6.5, color=canvas.MUTED)
-        return in_format(figure)
+            canvas.write(figure, x, line + 32, words, size=6.5, color=canvas.MUTED)
+        return canvas.in_format(figure)
 
 
 def title_of(asset: StoredAsset) -> str:
@@ -160,7 +159,3 @@ def _write(path: Path, content: bytes) -> None:
             f"the picture: cannot be written to {path} ({error.strerror or error}); make room "
             "there, or name another place with --picture, or --picture none"
         ) from error
-
-
-def _cut(title: str) -> str:
-    return title if len(title) <= _TITLE else f"{title[: _TITLE - 1]}…"
