@@ -76,14 +76,6 @@ def test_options_win_over_the_file(folder):
     assert parameters.normalize.ranges == "pixie"
 
 
-def test_options_alone_are_enough(folder):
-    parameters = load_parameters(
-        None,
-        {"pixieverse": {"root": str(folder / "grids")}, "slat": {"root": str(folder / "latents")}},
-    )
-    assert parameters.slat.root == folder / "latents"
-
-
 def test_preset_replaces_the_align_table(folder):
     path = write(folder, MINIMAL + '[align]\nengine = "small_gicp"\nradius = 2.5\n')
     assert load_parameters(path).align.radius == 2.5

@@ -7,7 +7,6 @@ from itertools import product
 import numpy as np
 import pytest
 
-from slatprep.demo.materials import MATERIALS
 from slatprep.errors import InputError
 from slatprep.readers import read_field
 from slatprep.readers.identity import hash_sources
@@ -73,12 +72,6 @@ def test_what_pixie_asks_for_is_plausible(make_pair, name):
     parts = [(material, *values) for values in product(*spans)]
     for part in parts:
         assert told(read_field(make_pair(grid_of(part)))) == []
-
-
-def test_the_materials_of_the_demo_are_plausible(make_pair):
-    for material, *spans in MATERIALS.values():
-        for values in (*zip(*spans, strict=True), [sum(span) / 2 for span in spans]):
-            assert told(read_field(make_pair(grid_of((material, *values))))) == []
 
 
 def test_stray_voxels_decide_nothing(make_pair):

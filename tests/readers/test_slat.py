@@ -43,12 +43,6 @@ def test_npz(make_pair, coords, dtype):
     assert latents.warnings == ()
 
 
-def test_order_of_the_file_is_kept(make_pair):
-    latents = read_latents(make_pair(coords=COORDS[::-1], feats=FEATS[::-1]))
-    np.testing.assert_array_equal(latents.coords, COORDS[::-1])
-    np.testing.assert_array_equal(latents.feats, FEATS[::-1])
-
-
 def test_compressed_and_fortran_ordered_npz(make_pair):
     pair = make_pair()
     np.savez_compressed(

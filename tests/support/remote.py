@@ -1,6 +1,7 @@
 """Stores put on S3, and what is in sight there."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,15 @@ def built(folder: Path, *ids: str, seed: int = 0) -> Made:
     dataset = Dataset(folder / "sources").having(*ids, seed=seed)
     build_store(dataset.parameters("pixie"), folder / "s.zarr")
     return dataset, folder / "s.zarr"
+
+
+def raising(error: Exception) -> Callable[..., Any]:
+    """Return a method of a client that fails whatever it is asked."""
+
+    async def raises(*_: Any, **__: Any) -> None:
+        raise error
+
+    return raises
 
 
 def put(store: Path, url: str) -> Path:

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from s3fs.core import S3FileSystem
 from support.faults import inject
 from support.faulty_proxy import Faults, faulty
-from support.remote import Dataset, current, put, versions
+from support.remote import Dataset, current, put, raising, versions
 from support.trees import contents, tree
 
 from slatprep.cli.commands import slatprep
@@ -151,11 +151,7 @@ def test_older_versions_that_must_not_be_removed_are_told(
     put(another[1], url)
     put(undisturbed[1], url)
     made = upload_store(another[1], published_state(place_of(url)))
-
-    async def denied(*_: Any, **__: Any) -> None:
-        raise PermissionError("Access Denied")
-
-    change_client("_rm", denied)
+    change_client("_rm", raising(PermissionError("Access Denied")))
     with pytest.warns(UserWarning, match=r"older versions could not be removed \(Access Denied\)"):
         made.publish()
     assert current(s3, url) == tree(another[1])
@@ -238,11 +234,7 @@ def test_places_that_cannot_be_written_are_told_before_the_work(
 @pytest.mark.parametrize("use", ["build", "verify", "info"])
 def test_a_store_that_cannot_be_listed_is_refused_in_words(url, another, change_client, use):
     put(another[1], url)
-
-    async def deaf(*args: Any, **options: Any) -> Any:
-        raise OSError("connection lost")
-
-    change_client("_lsdir", deaf)
+    change_client("_lsdir", raising(OSError("connection lost")))
     with pytest.raises(StoreError, match=r"cannot be listed \(connection lost"):
         if use == "build":
             build_store(another[0].parameters("pixie"), url)

@@ -2,13 +2,12 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 from s3fs.core import S3FileSystem
 from support import remote
 from support.faults import inject
-from support.remote import Dataset, Made, current, put
+from support.remote import Dataset, Made, current, put, raising
 from support.trees import tree
 
 from slatprep.errors import StoreError
@@ -82,12 +81,8 @@ def test_a_shard_that_is_gone_from_the_server_is_made_again(s3, url, built):
 def test_where_the_server_does_not_copy_the_old_store_stays(s3, url, built):
     dataset, beside = built
     dataset.add("b", seed=1)
-
-    async def denied(*_: Any, **__: Any) -> None:
-        raise PermissionError("Access Denied")
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(S3FileSystem, "_cp_file", denied)
+        patch.setattr(S3FileSystem, "_cp_file", raising(PermissionError("Access Denied")))
         with pytest.raises(StoreError, match=r"cannot be written .*nothing was replaced"):
             build_store(dataset.parameters("pixie"), url)
     assert current(s3, url) == tree(beside)
