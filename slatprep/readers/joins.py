@@ -7,6 +7,7 @@ import io
 import json
 import re
 from collections.abc import Collection, Iterable
+from itertools import chain
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters
@@ -16,6 +17,9 @@ from slatprep.storage.place import storage_of
 
 MAX_JSON_BYTES = 256 * 2**20
 """No list of categories is larger; one of 500,000 objects takes 50 MB."""
+
+_FORMS = (("object_id", "slat_id"), ("file_identifier", "sha256"))
+"""Columns that name objects and SLATs: of our own tables, and of TRELLIS's."""
 
 _UID = re.compile(r"([0-9a-f]{32})/?$")
 
@@ -35,14 +39,11 @@ def read_map(
         with io.TextIOWrapper(storage_of(path).open(), "utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             columns = set(reader.fieldnames or ())
-            for name in ("object_id", "slat_id", "view", "sha256", "file_identifier"):
+            for name in ("view", *chain.from_iterable(_FORMS)):
                 if (reader.fieldnames or ()).count(name) > 1:
                     raise ConfigError(f"{path}: has two columns {name}; expected one")
-            if {"object_id", "slat_id"} <= columns:
-                form = ("object_id", "slat_id")
-            elif {"sha256", "file_identifier"} <= columns:
-                form = ("file_identifier", "sha256")
-            else:
+            form = next((one for one in _FORMS if columns.issuperset(one)), None)
+            if form is None:
                 parted = len(columns) == 1 and any(sign in min(columns) for sign in ";\t")
                 hint = "; save it with commas between the columns" if parted else ""
                 raise ConfigError(

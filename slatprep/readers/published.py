@@ -142,7 +142,7 @@ def category_of(grid: Place | None) -> str:
     """Return the class that the name of a grid's archive tells; empty where none does."""
     if not isinstance(grid, ArchivePlace) or grid.archive is None:
         return ""
-    name = grid.archive.category
+    name = grid.archive.place.name.partition(".")[0]
     return "" if name in (GRIDS, ARCHIVES, "pixieverse") else name
 
 

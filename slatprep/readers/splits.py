@@ -121,10 +121,8 @@ class Assignment:
 
     def lists(self) -> dict[Split, list[str]]:
         """Return the objects of each split, sorted: what `read_lists` reads."""
-        by_split: dict[Split, list[str]] = {split: [] for split in SPLITS}
-        for object_id, split in sorted(self.splits.items()):
-            by_split[split].append(object_id)
-        return by_split
+        ids = sorted(self.splits)
+        return {split: [one for one in ids if self.splits[one] == split] for split in SPLITS}
 
 
 def assign_splits(

@@ -25,7 +25,7 @@ from slatprep.errors import InputError
 from slatprep.storage.atomic import staged_apart
 from slatprep.storage.cache import cache_folder, short
 from slatprep.storage.files import LocalFile, open_digest, open_regular
-from slatprep.storage.remote import RemoteFile, RemotePlace
+from slatprep.storage.remote import RemoteFile, RemotePlace, stamp_of
 from slatprep.storage.states import boot_id, lasting_state
 from slatprep.storage.tar import BLOCK, ArchiveError, Entry, ReadAhead, entries, unpack
 
@@ -39,9 +39,6 @@ _FORMAT, _INDEX = 3, "index.z"
 
 _STREAMED = 2**23
 """Bytes that an archive with gzip is read by."""
-
-_TAGS = ("ETag", "etag", "LastModified", "mtime", "blob_id", "lfs", "xet_hash")
-"""What object stores tell of an object's content."""
 
 _COMMIT = re.compile(r"(?<=[^/])@[0-9a-f]{40}(?=/|$)")
 _SAVE_S = 20.0
@@ -92,14 +89,7 @@ class Archive:
         cls, place: RemotePlace, entry: Mapping[str, Any], wanted: tuple[str, ...]
     ) -> Archive:
         """Take an archive as the listing of an object store has it."""
-        tags = (entry.get(key) for key in _TAGS)
-        stamp = " ".join([str(entry["size"]), *(str(tag) for tag in tags if tag)])
-        return cls(place, stamp, int(entry["size"]), True, wanted)
-
-    @property
-    def category(self) -> str:
-        """Its name without the extension, which in PixieVerse is that of a class."""
-        return self.place.name.partition(".")[0]
+        return cls(place, stamp_of(entry), int(entry["size"]), True, wanted)
 
     @property
     def packed(self) -> bool:

@@ -13,7 +13,13 @@ from pathlib import Path
 
 from slatprep.errors import StoreError
 from slatprep.storage.files import file_digest
-from slatprep.storage.remote import RemotePlace, connected, list_objects, multipart_options
+from slatprep.storage.remote import (
+    RemotePlace,
+    connected,
+    list_objects,
+    multipart_options,
+    stamp_of,
+)
 from slatprep.storage.versions import content_of, is_version, read_pointer
 
 VARIABLE = "SLATPREP_CACHE"
@@ -41,9 +47,8 @@ def cached_file(place: RemotePlace) -> Path:
     """
     with connected(place) as (system, name):
         entry = system.info(name)
-    state = [str(entry.get(key)) for key in ("size", "ETag", "etag", "LastModified", "mtime")]
     folder = folder_for(place)
-    copy = folder / short(" ".join(state))
+    copy = folder / short(stamp_of(entry))
     if copy.exists():
         return copy
     folder.mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import errno
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -22,6 +22,8 @@ from slatprep.storage.ranges import range_reader
 
 PART_BYTES = 2**24
 """Bytes per request in the upload or download of a large object."""
+
+_TAGS = ("ETag", "etag", "LastModified", "mtime", "blob_id", "lfs", "xet_hash")
 
 BUFFER_BYTES = 8 * 2**20
 """Bytes per request when a file is read from its beginning."""
@@ -99,15 +101,15 @@ class RemotePlace(PlaceByText):
 
     def exists(self) -> bool:
         """Whether it is an object, or there are objects below it."""
-        return self._kind() != ""
+        return bool(self.entry())
 
     def is_dir(self) -> bool:
         """Whether there are objects below it, and none of this name."""
-        return self._kind() == "directory"
+        return self.entry().get("type") == "directory"
 
     def is_file(self) -> bool:
         """Whether it is an object."""
-        return self._kind() == "file"
+        return self.entry().get("type") == "file"
 
     def _opened(self) -> IO[bytes]:
         return io.BufferedReader(RemoteFile(self), BUFFER_BYTES)
@@ -122,13 +124,14 @@ class RemotePlace(PlaceByText):
         with connected(self) as (system, name):
             system.put_file(str(local), name, **multipart_options(system))
 
-    def _kind(self) -> str:
+    def entry(self) -> Mapping[str, Any]:
+        """Return what fsspec says of it; nothing where there is nothing."""
         # Not isdir, which lists everything below.
         try:
             with connected(self) as (system, name):
-                return str(system.info(name)["type"])
+                return dict(system.info(name))
         except FileNotFoundError:
-            return ""
+            return {}
 
 
 class RemoteFile(io.RawIOBase):
@@ -219,6 +222,11 @@ class RemoteFolder:
     def open(self, name: str) -> RemoteFile:
         """Open a file for reading, without a request yet."""
         return RemoteFile(self._place / name)
+
+
+def stamp_of(entry: Mapping[str, Any]) -> str:
+    """Return what an object store tells of an object's content, in fsspec's entry of it."""
+    return " ".join(str(entry[key]) for key in ("size", *_TAGS) if entry.get(key))
 
 
 def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:

@@ -98,7 +98,7 @@ def published_state(target: RemotePlace) -> PublishedState:
         raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
     try:
         # The tag first: if the pointer moves in between, the tag is the old one and will not match.
-        tag = _tag(target / versions.POINTER)
+        tag = str((target / versions.POINTER).entry().get("ETag", ""))
         pointer = versions.read_pointer(target)
         others = [] if pointer else [name for name in list_objects(target) if not _is_ours(name)]
     except OSError as error:
@@ -270,14 +270,6 @@ def _is_of_version(name: str, but: Iterable[str] = ()) -> bool:
     kind, _, rest = name.partition("/")
     own, kinds = rest.partition("/")[0], (versions.VERSIONS, versions.MANIFESTS)
     return kind in kinds and versions.is_version_name(own) and own not in but
-
-
-def _tag(place: RemotePlace) -> str:
-    try:
-        with connected(place) as (system, name):
-            return str(system.info(name).get("ETag", ""))
-    except FileNotFoundError:
-        return ""
 
 
 @contextmanager
