@@ -17,7 +17,7 @@ from slatprep.errors import ConfigError, SlatprepError
 GROUPS = {
     "Make and build": {
         "make-demo": "slatprep.cli.demo:make_demo",
-        "extract-slat": "slatprep.cli.extract:extract_slat",
+        "extract-slat": "slatprep.cli.latents:extract_slat",
         "build-store": "slatprep.cli.build:build_store",
         "align": "slatprep.cli.build:align",
         "subset": "slatprep.cli.build:subset",
@@ -26,7 +26,7 @@ GROUPS = {
     "Look and check": {
         "info": "slatprep.cli.info:info",
         "list": "slatprep.cli.info:list_assets",
-        "stats": "slatprep.cli.stats:stats",
+        "stats": "slatprep.cli.info:stats",
         "report": "slatprep.cli.info:report",
         "check-alignment": "slatprep.cli.check:check_alignment",
         "score": "slatprep.cli.check:score",
@@ -36,7 +36,7 @@ GROUPS = {
         "export": "slatprep.cli.export:export",
         "transfer": "slatprep.cli.particles:transfer",
         "simulate": "slatprep.cli.particles:simulate",
-        "decode-slat": "slatprep.cli.extract:decode_slat",
+        "decode-slat": "slatprep.cli.latents:decode_slat",
         "describe": "slatprep.cli.publish:describe",
         "publish": "slatprep.cli.publish:publish",
     },

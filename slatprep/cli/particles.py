@@ -223,7 +223,7 @@ def simulate(
     slatprep simulate --store data/demo.zarr --asset 5f61cc --out frames --wind 8
     """
     from slatprep.particles import motion as work
-    from slatprep.particles.picture import require_picture
+    from slatprep.particles.gaussians import require_picture
 
     if picture is not None:
         require_picture(picture)

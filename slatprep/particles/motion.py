@@ -155,8 +155,6 @@ def write_frames(
     progress: Callable[[int, int], None],
 ) -> int:
     """Write ``frame-0000.ply`` and so on, and the picture; return the number of frames."""
-    from slatprep.particles.picture import draw, write_picture
-
     out.mkdir(parents=True, exist_ok=True)
     carrier = splats.bind(scene.places, scene.positions, scene.spacing)
     low = moved[0].min(axis=(0, 1)) - scene.spacing
@@ -168,8 +166,8 @@ def write_frames(
         rows = splats.deform(scene.vertices, places, local, scene.axes, stretch=stretch)
         splats.write_gaussians(out / f"frame-{number:04d}.ply", rows, FRAMES[scene.axes])
         if picture is not None:
-            pictures.append(draw(rows, places, low, high))
+            pictures.append(splats.draw(rows, places, low, high))
         progress(number + 1, frames)
     if picture is not None:
-        write_picture(picture, pictures, how.rate)
+        splats.write_picture(picture, pictures, how.rate)
     return frames

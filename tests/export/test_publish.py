@@ -21,8 +21,8 @@ from support import commands
 from support.published_hub import PublishedHub
 from support.trees import tree
 
-from slatprep.export.card import card_of
 from slatprep.export.croissant import Stated, describe, to_json
+from slatprep.export.publish import card_of
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.store import open_store
 from slatprep.store.layout import ARRAYS

@@ -18,11 +18,12 @@ from slatprep.particles.gaussians import (
     carry,
     colours_of,
     deform,
+    draw,
     gaussians_of,
     rotations,
     write_gaussians,
+    write_picture,
 )
-from slatprep.particles.picture import draw, write_picture
 from slatprep.particles.read import SAVED_AXES
 
 H = 1 / 16
