@@ -38,7 +38,7 @@ def hub(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
     HfFileSystem.clear_instance_cache()
 
 
-@pytest.mark.parametrize("root", ["", "/archives/render_outputs", "@main"])
+@pytest.mark.parametrize("root", ["", "@main"])
 def test_store_of_the_hub_is_that_of_the_unpacked_folder(hub, made, tmp_path, unpacked, root):
     build_store(parameters(made, URL + root), tmp_path / "s.zarr")
     assert files(tmp_path / "s.zarr") == unpacked

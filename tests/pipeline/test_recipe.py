@@ -1,13 +1,20 @@
-"""What decides an asset's key, and what is said when it has another one."""
+"""What decides an asset's key, its code among it, and what is said when it has another one."""
 
+import ast
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.pipeline import fingerprint
 from slatprep.pipeline.dataset import BuildSummary
+from slatprep.pipeline.fingerprint import code_fingerprint, numeric_modules
 from slatprep.pipeline.recipe import Recipe
+from slatprep.readers.adapters import LATENTS, SOURCES
 from slatprep.store.record import AssetRecord, StageParameters
 from slatprep.store.record_json import read_asset_record
 
@@ -56,3 +63,106 @@ def test_what_changed_is_said(record):
     assert newer.difference(record, ()) == f"libraries changed: numpy was {was}, is 99.0"
     unknown = replace(same, versions={"small_gicp": "1.0"})
     assert unknown.difference(record, ()) == "libraries changed: small_gicp was None, is 1.0"
+
+
+def fingerprint_of(monkeypatch: pytest.MonkeyPatch, path: Path) -> str:
+    monkeypatch.setattr(fingerprint, "numeric_modules", lambda: {"m": path})
+    return code_fingerprint.__wrapped__()
+
+
+def test_statements_count_and_words_do_not(tmp_path, monkeypatch):
+    module = tmp_path / "m.py"
+
+    def of(text: str) -> str:
+        module.write_text(text)
+        return fingerprint_of(monkeypatch, module)
+
+    first = of('"""Words."""\n\n\ndef f(x):\n    """More."""\n    return x + 1  # why\n')
+    assert of("def f(x):\n    return (x +\n            1)\n") == first
+    assert of("def f(x):\n    return x + 2\n") != first
+
+
+def test_a_tree_is_written_alike_under_every_python():
+    text = "class C[T]: x: int = None" if sys.version_info >= (3, 12) else "class C: x: int = None"
+    tree = ast.parse("def f(a, *, b=[]): return f'{a!r:>{b}}' 'x'")
+    assert fingerprint._dump(tree) == (
+        "Module(body=[FunctionDef(name='f', args=arguments(args=[arg(arg='a')], "
+        "kwonlyargs=[arg(arg='b')], kw_defaults=[List(ctx=Load())]), body=[Return("
+        "value=JoinedStr(values=[FormattedValue(value=Name(id='a', ctx=Load()), conversion=114, "
+        "format_spec=JoinedStr(values=[Constant(value='>'), FormattedValue(value=Name(id='b', "
+        "ctx=Load()), conversion=-1)])), Constant(value='x')]))])])"
+    )
+    assert ("type_params" in fingerprint._dump(ast.parse(text))) == ("[" in text)
+
+
+def answers(python: str) -> bool:
+    return subprocess.run([python, "-c", ""], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("minor", [11, 12, 13, 14])
+def test_it_is_the_same_under_another_python(minor):
+    python = shutil.which(f"python3.{minor}")
+    if minor == sys.version_info[1] or python is None or not answers(python):
+        pytest.skip("this Python, or none")
+    # The module alone, as another Python need not have the libraries.
+    code = f"import runpy; print(runpy.run_path({fingerprint.__file__!r})['code_fingerprint']())"
+    told = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == code_fingerprint()
+
+
+def test_it_covers_every_module_that_an_asset_runs_through_and_is_the_same_elsewhere():
+    """Trace what is loaded for one asset, in a process that has loaded nothing else."""
+    code = (
+        "import sys; from slatprep.readers.pixieverse import read_grid; "
+        "from slatprep.readers.slat import read_slat; from slatprep.sample import sample; "
+        "from slatprep.judge import judge; from slatprep.align import quality, field; "
+        "print(*(m for m in sys.modules if m.startswith('slatprep'))); "
+        "from slatprep.pipeline.fingerprint import code_fingerprint; print(code_fingerprint())"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules, key = told.stdout.splitlines()
+    assert key == code_fingerprint()
+    loaded = set(modules.split())
+    # Packages that only gather names, words of errors, and values that the key holds.
+    uncounted = {
+        "slatprep",
+        "slatprep.geometry",
+        "slatprep.readers",
+        "slatprep.storage",
+        "slatprep.errors",
+        "slatprep.parameters",
+    }
+    # These find files, and read none.
+    finding = {f"slatprep.readers.{name}" for name in ("pairing", "joins", "slat_files")}
+    # Whichever way bytes come, their digests tell them.
+    carrying = {name for name in loaded if name.startswith("slatprep.storage.")}
+    assert loaded - set(numeric_modules()) <= uncounted | finding | carrying
+
+
+def test_what_makes_numbers_is_in_it_and_nothing_else():
+    modules = numeric_modules()
+    readers = {name.partition(":")[0] for name in [*SOURCES.values(), *LATENTS.values()]}
+    merging = {f"slatprep.{name}" for name in ("pipeline.annotate", "storage.chunks")}
+    assert readers | merging | {"slatprep.storage.chunks"} <= modules.keys()
+    others = ("slatprep.storage.pl", "slatprep.cli", "slatprep.store")
+    assert not [name for name in modules if name.startswith((*others, "slatprep.pipeline.dataset"))]
+    for path in modules.values():
+        ast.parse(path.read_text())
+
+
+def test_what_packs_rows_makes_columns_and_records_is_in_the_other(monkeypatch, tmp_path):
+    """Code that is in no key, and still decides bytes."""
+    wanted = {"normalize", "pipeline.pack", "pipeline.recipe", "store.record_json",
+              "store.shard_writer", "store.layout"}  # fmt: skip
+    assert {f"slatprep.{name}" for name in wanted} <= set(fingerprint.PACKING)
+    before = fingerprint.packing_fingerprint.__wrapped__()
+    source = fingerprint._source
+    for name in fingerprint.PACKING:
+        changed = tmp_path / f"{name}.py"
+        changed.write_bytes(source(name).read_bytes() + b"\nCHANGED = 1\n")
+        monkeypatch.setattr(
+            fingerprint, "_source", lambda one, n=name, c=changed: c if one == n else source(one)
+        )
+        assert fingerprint.packing_fingerprint.__wrapped__() != before
+    monkeypatch.setattr(fingerprint, "_source", source)
+    assert fingerprint.packing_fingerprint.__wrapped__() == before

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib.style
 import numpy as np
 import pytest
 import zarr
@@ -24,7 +23,8 @@ from support.trees import tree
 
 from slatprep.errors import StoreError
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
-from slatprep.inspect.check import check_alignment, choose_assets
+from slatprep.inspect.check import AlignmentCheck, check_alignment, choose_assets
+from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import (
     HEIGHT,
     PANEL,
@@ -34,12 +34,11 @@ from slatprep.inspect.pictures.alignment import (
     draw_alignment,
     panels,
 )
-from slatprep.inspect.pictures.canvas import STYLE
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours, scene_of, views
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.voxels import View
 from slatprep.inspect.pictures.write import write_pictures
-from slatprep.records import Placement, Search
+from slatprep.records import Alignment, Placement, Search
 from slatprep.store import open_store
 from slatprep.store.records import StoredRecords
 
@@ -52,6 +51,13 @@ def misplace(path: Path, row: int, shift: float) -> None:
     transform = QUARTER_TURN.copy()
     transform[0, 3] = shift
     zarr.open_group(path, mode="r+")["asset/transform"][row] = transform
+
+
+def of_ant(path: Path) -> tuple[Scene, AlignmentCheck, Alignment]:
+    """Return what a picture of an asset is drawn of."""
+    store = open_store(path)
+    alignment = StoredRecords(store).of("ant").alignment
+    return scene_of(store.asset("ant")), check_alignment(store, "ant"), alignment
 
 
 @pytest.fixture
@@ -121,22 +127,20 @@ def test_on_a_full_disk_the_picture_that_is_there_stays(copy, tmp_path):
 
 @pytest.mark.usefixtures("sides")
 def test_the_next_of_tied_placements_stands_beside_the_chosen_one(copy):
-    store = open_store(copy)
-    asset, check = store.asset("ant"), check_alignment(store, "ant")
-    alignment = StoredRecords(store).of("ant").alignment
-    turned = asset.transform @ QUARTER_TURN
-    ties = tuple(Placement(at, score, 9.0) for at, score in ((asset.transform, 0.5), (turned, 0.7)))
+    one, check, alignment = of_ant(copy)
+    turned = one.transform @ QUARTER_TURN
+    ties = tuple(Placement(at, score, 9.0) for at, score in ((one.transform, 0.5), (turned, 0.7)))
     tied = replace(alignment, placements=ties, settled_by=None)
-    with matplotlib.style.context(["default", STYLE]):
-        figure = draw_alignment(scene_of(asset), check, "t", "s", tied)
+    with canvas.styled():
+        figure = draw_alignment(one, check, "t", "s", tied)
         words = [text.get_text() for text in figure.findobj(Text)]
     assert "placement that fits about as well" in words
     assert figure.bbox.width == WIDTH + PANEL + 14
-    scene = replace(scene_of(asset), tied=turned)
+    scene = replace(one, tied=turned)
     assert len(columns_of(scene)) == 5
     before, after, another, result, error = panels(scene, views(scene, 90)[0])
     assert np.abs(another - after).sum() > 9
-    alone = panels(scene_of(asset), views(scene, 90)[0])
+    alone = panels(one, views(scene, 90)[0])
     for one, other in zip((before, after, result, error), alone, strict=True):
         assert np.array_equal(one, other)
 
@@ -147,12 +151,9 @@ def test_no_words_are_cut_or_written_over_others(copy):
     for name, value in (("confidence", 0.4), ("expected_accuracy", 0.5), ("contradicted", True)):
         group[f"asset/{name}"][0] = value
     misplace(copy, 0, 0.06)
-    store = open_store(copy)
-    check = check_alignment(store, "ant")
-    alignment = StoredRecords(store).of("ant").alignment
-    scene = scene_of(store.asset("ant"))
+    scene, check, alignment = of_ant(copy)
     for search in Search:
-        with matplotlib.style.context(["default", STYLE]):
+        with canvas.styled():
             figure = draw_alignment(scene, check, "t", "s", replace(alignment, search=search))
             whole = " ".join(whole_texts(figure))
         assert len(check.reasons) >= 4 and all(reason in whole for reason in check.reasons)
@@ -164,17 +165,14 @@ def test_no_words_are_cut_or_written_over_others(copy):
 @pytest.mark.usefixtures("sides")
 @pytest.mark.parametrize("count", [9, 60])
 def test_the_names_of_many_classes_stay_on_the_picture(count, copy):
-    store = open_store(copy)
-    check = check_alignment(store, "ant")
-    alignment = StoredRecords(store).of("ant").alignment
-    one = scene_of(store.asset("ant"))
+    one, check, alignment = of_ant(copy)
     many = replace(
         one,
         slat_material=(np.arange(len(one.slat)) % count).astype(np.uint8),
         pixieverse_material=np.zeros(len(one.pixieverse), np.uint8),
         labels=tuple(f"material {k}" for k in range(count)),
     )
-    with matplotlib.style.context(["default", STYLE]):
+    with canvas.styled():
         texts = whole_texts(draw_alignment(many, check, "t", "s", alignment))
     names = [text for text in texts if text.startswith("material ")]
     left = [text for text in texts if text.endswith(" more")]
