@@ -23,16 +23,11 @@ from slatprep.records.alignment import (
     Quality,
 )
 from slatprep.records.json_types import (
-    AffineMap,
     Count,
     Digest,
     InJson,
-    Lattice,
     Number,
-    Point,
-    Rotation,
     Share,
-    Transform,
     one_of,
 )
 from slatprep.records.results import (

@@ -189,13 +189,17 @@ def shard(tmp_path: Path) -> Path:
     return tmp_path / "voxel/material/c/0"
 
 
+def refused(folder: Path, start: int, stop: int, told: str) -> None:
+    with pytest.raises(StoreError, match=told):
+        reader_of(folder, "voxel/material").read(start, stop)
+
+
 def test_an_index_that_leads_out_of_its_file_is_refused(tmp_path, shard):
     index, end = index_of(shard, 4), shard.stat().st_size - 68
     assert sum(index[-1]) == end  # The index itself begins there.
     for wrong in ((end + 1, 1), (0, end + 1), (NOT_THERE, 1), (0, NOT_THERE)):
         write_index(shard, [*index[:3], wrong])
-        with pytest.raises(StoreError, match="c/0: its index leads out of it"):
-            reader_of(tmp_path, "voxel/material").read(0, 8)
+        refused(tmp_path, 0, 8, "c/0: its index leads out of it")
 
 
 def test_an_entry_much_longer_than_its_chunk_is_refused(tmp_path, shard):
@@ -206,19 +210,16 @@ def test_an_entry_much_longer_than_its_chunk_is_refused(tmp_path, shard):
     write_index(shard, moved)
     assert len(reader_of(tmp_path, "voxel/material").read(0, 32)) == 32
     write_index(shard, [(0, 65_536 + 17), *moved[1:]])
-    with pytest.raises(StoreError, match="its index leads out of it"):
-        reader_of(tmp_path, "voxel/material").read(8, 16)
+    refused(tmp_path, 8, 16, "its index leads out of it")
 
 
 def test_a_file_without_a_whole_index_is_refused(tmp_path, shard):
     content = shard.read_bytes()
     for torn in (b"", content[-67:], content[:-1]):
         shard.write_bytes(torn)
-        with pytest.raises(StoreError, match="has no sound index; it is damaged or cut short"):
-            reader_of(tmp_path, "voxel/material").read(0, 8)
+        refused(tmp_path, 0, 8, "has no sound index; it is damaged or cut short")
     shard.write_bytes(content[-68:])  # an index of chunks that are not there
-    with pytest.raises(StoreError, match="its index leads out of it"):
-        reader_of(tmp_path, "voxel/material").read(0, 8)
+    refused(tmp_path, 0, 8, "its index leads out of it")
 
 
 def test_an_index_of_fill_values_alone_is_a_shard(tmp_path, shard):
