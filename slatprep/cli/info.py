@@ -12,8 +12,8 @@ from slatprep.cli.output import Cell, Output, say, write_csv
 from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
-    from slatprep.inspect.distributions import Distribution, GroupStatistics, StoreStatistics
     from slatprep.inspect.overview import StoreOverview
+    from slatprep.inspect.statistics import Distribution, GroupStatistics, StoreStatistics
     from slatprep.records import Place
     from slatprep.store import Store
 
@@ -249,7 +249,7 @@ def stats(
     store: options.LastStore,
     *,
     chosen: options.ChosenOptions,
-    weight: Annotated[Any, options.ChoiceOf("slatprep.inspect.distributions:Weight")] = "voxel",
+    weight: Annotated[Any, options.ChoiceOf("slatprep.inspect.statistics:Weight")] = "voxel",
     csv_file: Annotated[options.NewFile | None, Click("--csv")] = None,
     picture: options.DrawnFile | None = None,
     jobs: options.Jobs = 1,
@@ -274,8 +274,7 @@ def stats(
     slatprep stats data/demo.zarr
     slatprep stats data/demo.zarr --verdict good --weight asset --picture demo.png --csv demo.csv
     """
-    from slatprep.inspect.distributions import COLUMNS, table_of
-    from slatprep.inspect.statistics import store_statistics
+    from slatprep.inspect.statistics import COLUMNS, store_statistics, table_of
 
     opened = options.opened(store)
     with output.progress("stats") as progress:

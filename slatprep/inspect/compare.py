@@ -14,7 +14,7 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import displacement, voxel_centres
 from slatprep.inspect.difference import AssetChange, PropertyChange, Setting, StoreDifference
 from slatprep.normalize import denormalize_properties
-from slatprep.pipeline.previous import SourceStore
+from slatprep.pipeline.rows import SourceStore
 from slatprep.records import RESOLUTION, Place
 from slatprep.store import Store, open_store
 from slatprep.store.assets import ASSET_COLUMNS

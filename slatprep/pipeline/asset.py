@@ -37,9 +37,8 @@ from slatprep.parameters import AlignParameters, BuildParameters, SampleParamete
 from slatprep.pipeline.annotate import annotate, process_several
 from slatprep.pipeline.before import as_read
 from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
-from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe, record_of, record_of_failed
-from slatprep.pipeline.rows import Row
+from slatprep.pipeline.rows import Row, SourceStore
 from slatprep.pipeline.spool import Spool
 from slatprep.readers import read_field, read_latents
 from slatprep.readers.identity import reading_of, source_digests

@@ -27,10 +27,9 @@ import orjson
 
 from slatprep.errors import InputError, SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.previous import SourceStore, checked_store, store_there
 from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.recipe import Recipe
-from slatprep.pipeline.rows import NextStore
+from slatprep.pipeline.rows import NextStore, SourceStore, checked_store, store_there
 from slatprep.readers.identity import hash_sources
 from slatprep.readers.slat import texture_of
 from slatprep.records import AssetPair, Contents, Place

@@ -19,9 +19,8 @@ import orjson
 from slatprep.errors import ConfigError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.pack import pack_store
-from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.publish import Destination, publish_manifests
-from slatprep.pipeline.rows import NextStore, Row
+from slatprep.pipeline.rows import NextStore, Row, SourceStore
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.summary import BuildSummary, summarise_store
 from slatprep.pipeline.work import work_beside, work_directory

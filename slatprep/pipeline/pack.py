@@ -19,8 +19,7 @@ from slatprep.normalize import (
     normalize_change,
     normalize_properties,
 )
-from slatprep.pipeline.previous import SourceStore
-from slatprep.pipeline.rows import NextStore, Where, record_text
+from slatprep.pipeline.rows import NextStore, SourceStore, Where, record_text
 from slatprep.pipeline.spool import Spool
 from slatprep.records import UNANNOTATED, Normalization, Place
 from slatprep.storage.faults import reached

@@ -15,9 +15,8 @@ from types import MappingProxyType
 from slatprep.errors import SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.before import as_read
-from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import Recipe
-from slatprep.pipeline.rows import Names
+from slatprep.pipeline.rows import Names, SourceStore
 from slatprep.pipeline.spool import Spool
 from slatprep.readers.identity import hash_sources
 from slatprep.records import AssetPair, Place, SourceFile

@@ -15,9 +15,8 @@ from slatprep.normalize import ranges_from_bounds, ranges_from_extents, to_mappe
 from slatprep.parameters import BuildParameters, NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.before import Before
 from slatprep.pipeline.plan import BuildContext, Crew, PlannedAsset
-from slatprep.pipeline.previous import SourceStore
 from slatprep.pipeline.recipe import build_of
-from slatprep.pipeline.rows import NextStore, Row, column, in_order, moments_of
+from slatprep.pipeline.rows import NextStore, Row, SourceStore, column, in_order, moments_of
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.summary import nothing_usable
 from slatprep.readers import contents_of

@@ -14,14 +14,14 @@ from support.commands import document, refused, run
 
 from slatprep import StoreError, open_store
 from slatprep.cli.output import as_json
-from slatprep.inspect.distributions import (
+from slatprep.inspect.pictures.statistics import draw_statistics
+from slatprep.inspect.statistics import (
     QUANTILES,
     PropertyStatistics,
     SideStatistics,
     StoreStatistics,
+    store_statistics,
 )
-from slatprep.inspect.pictures.statistics import draw_statistics
-from slatprep.inspect.statistics import store_statistics
 from slatprep.pipeline.dataset import BuildSummary
 
 CATEGORIES = ["b", "", "a", "=b", "b"]

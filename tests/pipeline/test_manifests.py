@@ -8,7 +8,7 @@ from support.synthetic import Dataset, Made, MakeDataset, make_asset
 from support.trees import inodes, records_of
 
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline import previous
+from slatprep.pipeline import rows
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.store import layout, open_store, records
 from slatprep.store.layout import ARRAYS
@@ -79,7 +79,7 @@ def test_an_update_writes_what_is_new_and_the_last_shards(built):
 @pytest.fixture
 def two_a_shard(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut records into shards of two rows."""
-    for module in (layout, records, previous):
+    for module in (layout, records, rows):
         monkeypatch.setattr(module, "RECORDS_IN_SHARD", 2)
     for module in (layout, records):
         monkeypatch.setattr(module, "RECORDS_IN_CHUNK", 2)

@@ -19,7 +19,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline import recipe, rows
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.pipeline.previous import checked_store
+from slatprep.pipeline.rows import checked_store
 from slatprep.storage import states
 from slatprep.store import layout, open_store
 from slatprep.store.shard_reader import RowReader

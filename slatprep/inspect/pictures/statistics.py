@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.inspect.distributions import Histogram, JointHistogram, StoreStatistics
 from slatprep.inspect.pictures import canvas
+from slatprep.inspect.statistics import Histogram, JointHistogram, StoreStatistics
 from slatprep.pipeline.decoys import MeasuredErrors
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, Property
 from slatprep.store.reader import Store

@@ -38,7 +38,7 @@ from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.geometry.voxels import boundary, filled
 from slatprep.inspect.tallies import Tally, tally
-from slatprep.pipeline.previous import SourceStore
+from slatprep.pipeline.rows import SourceStore
 from slatprep.records import MATERIAL_COLOURS, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 

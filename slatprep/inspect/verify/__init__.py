@@ -16,7 +16,7 @@ import numpy as np
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import asset_findings
 from slatprep.inspect.verify.manifests import manifest_findings, moved, source_roots
-from slatprep.pipeline.previous import SourceStore
+from slatprep.pipeline.rows import SourceStore
 from slatprep.readers.patterns import ASSET_ID, NAME
 from slatprep.records import RESOLUTION, Engine, Model, Place, Search, SourceRoots, Verdict
 from slatprep.storage.place import place_of, storage_of

@@ -19,7 +19,7 @@ from slatprep.judge.evidence import labels_hold
 from slatprep.normalize import normalize_change, normalize_properties
 from slatprep.pipeline.annotate import annotate
 from slatprep.pipeline.fingerprint import code_fingerprint
-from slatprep.pipeline.previous import PLACE_TOLERANCE, SourceStore
+from slatprep.pipeline.rows import PLACE_TOLERANCE, SourceStore
 from slatprep.readers import read_field
 from slatprep.readers.files import is_hierarchy, load_source
 from slatprep.records import (
