@@ -132,7 +132,8 @@ def normalize_and_count(
     properties: ArrayLike, normalization: Normalization
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Normalise as `normalize_properties`, and count the clipped values per property (P,)."""
-    given = _in_columns(properties, normalization)
+    # A column after the other in memory: along rows as narrow numpy takes twice the time.
+    given = np.asfortranarray(_in_columns(properties, normalization))
     mapped = to_mapped(given, normalization.ranges)
     # Counted after rounding: a range's own end point must not count as clipped.
     values = normalize_mapped(mapped, normalization).astype(np.float32)

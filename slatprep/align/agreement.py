@@ -69,14 +69,20 @@ def _by_direction(apart: Array, normals: Array) -> tuple[Array, Array, NDArray[n
     return near, middle, counts[use]
 
 
-def _by_block(apart: Array, places: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Return the median of what lies apart in each block of space, and its samples."""
+def blocks_of(places: Array) -> NDArray[np.intp]:
+    """Number the blocks of space that have samples; return that of each of the places (N, 3)."""
     cells = np.floor(places / BLOCK).astype(np.intp)
     cells -= cells.min(axis=0)
     # Far more than blocks a side, so that no two blocks have one number.
     numbers = cells @ np.array([1 << 32, 1 << 16, 1])
-    _, groups, counts = np.unique(numbers, return_inverse=True, return_counts=True)
-    order, first = _sorted_by(groups.reshape(-1), apart, counts)
+    return np.unique(numbers, return_inverse=True)[1].reshape(-1)
+
+
+def _by_block(apart: Array, places: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return the median of what lies apart in each block of space, and its samples."""
+    groups = blocks_of(places)
+    counts = np.bincount(groups)
+    order, first = _sorted_by(groups, apart, counts)
     median: Array = apart[order[first + (counts - 1) // 2]]
     return median, counts
 

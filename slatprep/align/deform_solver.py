@@ -45,7 +45,7 @@ class Lines(NamedTuple):
     def at(cls, places: NDArray[np.float64]) -> Lines:
         """Return empty lines of samples at these places."""
         n = len(places)
-        return cls(places, np.zeros(n, np.uint64), np.zeros((n, 12)), np.zeros((n, 4)), np.zeros(n))
+        return cls(places, np.empty(n, np.uint64), np.empty((n, 12)), np.empty((n, 4)), np.empty(n))
 
     def rows(self, chosen: slice | NDArray[np.intp]) -> Lines:
         """Return some rows; a slice shares memory."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slatprep.align.agreement import BLOCK
+from slatprep.align.agreement import blocks_of
 from slatprep.align.deform import Deformed, deform_if_earned
 from slatprep.align.pair import (
     FINE_SAMPLES,
@@ -92,8 +92,7 @@ def standard_errors(pair: Pair, best: Deformed, others: Sequence[Deformed]) -> l
     if not others:
         return []
     kernels, places = _kernels(pair, best)
-    cells = np.floor(places / BLOCK).astype(np.intp)
-    blocks = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    blocks = blocks_of(places)
     found = []
     for other in others:
         gains = np.bincount(blocks, kernels - _kernels(pair, other)[0])

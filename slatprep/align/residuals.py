@@ -49,8 +49,6 @@ class Residuals:
         carried = pose.scale * there.points @ pose.rotation.T + pose.shift
         self._lines = Lines.at(np.concatenate([here.points, carried]))
         self._pixie_rows = len(here.points)
-        box = slat.points.min(axis=0) - 1.0, slat.points.max(axis=0) + 1.0
-        self._low, self._side = box[0], box[1] - box[0]
 
     def start(self) -> Warp:
         """Return the warp that leaves the similarity as it is."""
@@ -62,7 +60,8 @@ class Residuals:
 
     def held_out(self) -> NDArray[np.bool_]:
         """Return which samples lie in the blocks that a trial does not see."""
-        blocks = np.floor((self._lines.places - self._low) / BLOCK).astype(np.intp)
+        low = self.surface.points.min(axis=0) - 1.0
+        blocks = np.floor((self._lines.places - low) / BLOCK).astype(np.intp)
         odd: NDArray[np.bool_] = blocks.sum(axis=1) % 2 == 1
         return odd
 
@@ -120,8 +119,10 @@ class Residuals:
 
     def with_lattice(self, warp: Warp) -> Warp:
         """Return the same warp with the coarsest lattice over the SLAT."""
-        spans = np.maximum(np.ceil(self._side / COARSEST - 1e-9), 1.0).astype(int)
-        origin = self._low - 0.5 * (spans * COARSEST - self._side)
+        low = self.surface.points.min(axis=0) - 1.0
+        side = self.surface.points.max(axis=0) + 1.0 - low
+        spans = np.maximum(np.ceil(side / COARSEST - 1e-9), 1.0).astype(int)
+        origin = low - 0.5 * (spans * COARSEST - side)
         coefficients = np.zeros((*(spans + 3), 3))
         return warp._replace(origin=origin, spacing=COARSEST, coefficients=coefficients)
 

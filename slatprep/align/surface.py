@@ -109,7 +109,7 @@ class Surface:
             if len(chosen) > count:
                 chosen = even_choice(len(chosen), count, first)
                 # In order, so each is compared with the one before it: no sorting once more.
-                chosen = chosen[np.diff(chosen, prepend=-1) > 0]
+                chosen = chosen[np.append(True, chosen[1:] > chosen[:-1])]
             some = replace(self, points=self.points[chosen], values=self.values[chosen])
             self._subsets[count, first] = some
         return self._subsets[count, first]
@@ -145,7 +145,8 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
     distance = signed_distance(solid)
     near, values = near_surface(distance, BAND)
     # Half a voxel deep are just those that touch an empty voxel by a face.
-    boundary = near[values == -0.5] + [side.start - _MARGIN for side in box]
+    boundary = near.take(np.flatnonzero(values == -0.5), axis=0)
+    boundary += np.array([side.start - _MARGIN for side in box]).astype(np.uint8)
     distance += np.float32(DILATION)
     origin = np.array([side.start for side in box], dtype=np.float64) - _MARGIN - CENTRE
     return Surface(
@@ -153,7 +154,7 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
         origin=origin,
         points=near + origin,
         values=values.astype(np.float64) + DILATION,
-        boundary=boundary.astype(np.uint8),
+        boundary=boundary,
     )
 
 

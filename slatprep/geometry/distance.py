@@ -146,27 +146,29 @@ def _signed(solid, inside, outside, distance):  # type: ignore[no-untyped-def]
                 distance[i, j, k] = -apart if solid[i, j, k] else apart
 
 
-def near_surface(
-    distance: NDArray[np.float32], band: float
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+@kernel()
+def near_surface(distance, band):  # type: ignore[no-untyped-def]
     """Return the lattice points (M, 3) within `band` voxels of a surface, and their distances (M,).
 
     In C order; of the points a column lies after the other in memory.
     """
-    points = np.empty((3, np.count_nonzero(np.abs(distance) <= band)), dtype=np.uint8)
-    values = np.empty(points.shape[1], dtype=np.float32)
-    _near_surface(distance, np.float32(band), points, values)
-    return points.T, values
-
-
-@kernel()
-def _near_surface(distance, band, points, values):  # type: ignore[no-untyped-def]
-    found = 0
+    limit = np.float32(band)
+    lines = np.zeros(distance.shape[:2], np.int64)
     for i in range(distance.shape[0]):
         for j in range(distance.shape[1]):
             for k in range(distance.shape[2]):
+                lines[i, j] += abs(distance[i, j, k]) <= limit
+    points = np.empty((3, lines.sum()), np.uint8)
+    values = np.empty(points.shape[1], np.float32)
+    found = 0
+    for i in range(distance.shape[0]):
+        for j in range(distance.shape[1]):
+            if lines[i, j] == 0:
+                continue
+            for k in range(distance.shape[2]):
                 value = distance[i, j, k]
-                if abs(value) <= band:
+                if abs(value) <= limit:
                     points[0, found], points[1, found], points[2, found] = i, j, k
                     values[found] = value
                     found += 1
+    return points.T, values
