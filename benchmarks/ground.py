@@ -243,7 +243,7 @@ def _other(assets: Sequence[Asset], at: int) -> Asset:
 
 
 def _rows(asset: Asset, other: Asset, looks: bool) -> list[Row]:
-    with patch.object(engine, "find_ground", engine.find_ground if looks else lambda _: None):
+    with patch.object(engine, "find_layers", engine.find_layers if looks else lambda _: []):
         rows = [_row(asset, asset, kind) for kind in GROUNDS]
         return [*rows, _row(asset, other, "full")]
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from slatprep.align.deform import CLEAN, Deformed
 from slatprep.align.figures import measure_figures
 from slatprep.align.finish import finish, rank_of
-from slatprep.align.ground import find_ground, is_ground
+from slatprep.align.ground import LEAST_ABOVE, LEAST_GAIN, RAISED, find_layers, gain, raised
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE_SAMPLES, COARSE_TAUS, MOST_SURVIVORS, TIE, Pair
 from slatprep.align.pose import Pose, Similarity
@@ -72,12 +72,30 @@ def align(
     """Align by distance fields; see `slatprep.align.align`."""
     pair = _pair_of(field, latents, parameters)
     found = _search(pair)
-    ground = find_ground(pair.pixie) if HOPELESS < found.score < POOR else None
-    if ground is None:
+    return _above_ground(field, pair, found) if HOPELESS < found.score < POOR else found
+
+
+def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignment:
+    """Return the best of the alignments without a flat layer, if it is clearly better."""
+
+    def without(ground: Ground) -> Alignment:
+        solid = above(field.occupancy, ground)
+        if np.count_nonzero(solid) < LEAST_ABOVE * np.count_nonzero(field.occupancy):
+            return found
+        there = Pair(pair.slat, surface_of(solid), pair.parameters)
+        return replace(_search(there), ground=ground)
+
+    def gains(alignment: Alignment) -> float:
+        return gain(alignment, found)
+
+    first, *further = RAISED
+    tried = [without(raised(layer, first)) for layer in find_layers(pair.pixie)]
+    best = max(tried, key=gains, default=found)
+    if best.ground is None or gains(best) < -LEAST_GAIN:
         return found
-    pixie = surface_of(above(field.occupancy, ground))
-    without = _search(Pair(pair.slat, pixie, parameters))
-    return replace(without, ground=ground) if is_ground(without, found) else found
+    tried = [without(raised(best.ground, by - first)) for by in further]
+    best = max([best, *tried], key=gains)
+    return best if gains(best) > 0.0 else found
 
 
 def _search(pair: Pair) -> Alignment:
@@ -101,7 +119,7 @@ def _search(pair: Pair) -> Alignment:
             poses = ranked(pair, pair.distinct([*poses, *wide]), halfway)
 
     may_contest = pair.may_deform and poses[0].score < POOR
-    reach = 2 * TIE if may_contest else TIE
+    reach, tie = (2 * TIE, CLOSE) if may_contest else (TIE, TIE)
     near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
     tied, deformed = finish(pair, near, rough=poses[0].score < CLEAN)
     best = tied[0]
@@ -122,7 +140,7 @@ def _search(pair: Pair) -> Alignment:
         placements=tuple(
             Placement(pose.similarity.transform, pose.score, float(pair.apart([pose], best)[0]))
             for pose in others[:MOST_SURVIVORS]
-            if pose.behind < CLEARLY and pose.merit > best.merit - (CLOSE if may_contest else TIE)
+            if not pose.behind >= CLEARLY and pose.merit > best.merit - tie
         ),
         score=best.score,
         deformation=deformed.deformation,
@@ -130,7 +148,7 @@ def _search(pair: Pair) -> Alignment:
             pair,
             best,
             deformed,
-            min((pose.behind for pose in others if pose.merit > best.merit - TIE), default=nan),
+            np.fmin.reduce([p.behind for p in others if p.merit > best.merit - reach], initial=nan),
         ),
     )
 

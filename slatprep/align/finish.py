@@ -29,7 +29,8 @@ from slatprep.align.warp import Warp, places_of
 from slatprep.records import FitFigures, Model
 
 MOST_CONTESTED = 4
-"""Where the best placement is deformed, so many, of those within twice `TIE`, are deformed too."""
+"""Where the best placement is deformed or the sides are rough, so many, of those within twice
+`TIE`, are deformed too."""
 
 CONTEST_SAMPLES, SHARP = 2_000, 0.5
 """Samples a side on which placements are held against each other, and the kernel's width [voxel]:
@@ -48,7 +49,7 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     fine = pair.refine(poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
     first, *others = pair.distinct(fine)
     best, deformed = _deformed(pair, first, rough)
-    if deformed.deformation is None:
+    if deformed.deformation is None and not (rough and pair.may_deform):
         near = [pose for pose in others if pose.merit > best.merit - TIE]
         fits = [
             replace(deformed, pose=pose.similarity, warp=Warp.unbent(pose.similarity))

@@ -33,24 +33,27 @@ NARROWINGS = 6
 HALF_LAYER = 3.5
 """Samples so near the middle of a layer, in voxels, belong to it."""
 
-LEAST_FACE = 0.08
+LEAST_FACE = 0.04
 """A layer is looked at whose face is this share of the annotation's surface, both sides counted."""
 
 LEAST_ABOVE = 0.05
 """This share of the voxels lies above ground at least: less is a board's lid, and not an object."""
+
+RAISED = (1.0, 0.0, 2.0)
+"""Voxels above a layer's top at which it is cut off; the first for each layer, the others for the
+best. An object stands in its ground, and that is rough."""
 
 LEAST_GAIN, MOST_LOST = 0.05, 0.08
 """A layer is ground if without it the scores of search and fit rise by so much together, and
 that of the SLAT's samples falls by less than so much, as it would were the layer the object's."""
 
 
-def find_ground(surface: Surface) -> Ground | None:
-    """Find the widest flat layer at an end of the PixieVerse side; it may be part of the object.
+def find_layers(surface: Surface) -> list[Ground]:
+    """Find flat layers at the ends of the PixieVerse side, widest first; any may be the object's.
 
     The ends with most samples of the surface are looked at. There a plane is fitted to the samples
     near it, again and again. The layer's top is where most voxels go away from one height to the
-    next, and the face is as large as these are many. None where no layer has a face of
-    `LEAST_FACE`.
+    next, and the face is as large as these are many. Faces are at least `LEAST_FACE` large.
     """
     points = surface.subset(SAMPLES).points
     solid = np.flatnonzero(surface.distance < DILATION)
@@ -58,22 +61,33 @@ def find_ground(surface: Surface) -> Ground | None:
     if total > VOXELS:
         solid = solid[even_choice(total, VOXELS)]
     inside = np.stack(np.unravel_index(solid, surface.distance.shape), axis=1) + surface.origin
+    least = 0.5 * LEAST_FACE * len(surface.points) * len(solid) / total
     found = [_layer(points, inside, end) for end in _ends(points)]
-    normal, top, face = max(found, key=lambda layer: layer[2])
-    if 2.0 * face * (total / len(solid)) < LEAST_FACE * len(surface.points):
-        return None
-    rounded = np.rint(np.append(normal, top * VOXEL_SIZE) / GRAIN) * GRAIN
-    return Ground(rounded[:3], float(rounded[3]))
+    wide = sorted((layer for layer in found if layer[2] > least), key=lambda layer: -layer[2])
+    return [_rounded(normal, top * VOXEL_SIZE) for normal, top, _ in wide]
 
 
-def is_ground(without: Alignment, found: Alignment) -> bool:
-    """Whether a SLAT fits better without a layer, so that this is no part of the object."""
+def raised(layer: Ground, voxels: float) -> Ground:
+    """Return a layer with its top so many voxels higher."""
+    return _rounded(layer.normal, layer.height + voxels * VOXEL_SIZE)
+
+
+def gain(without: Alignment, found: Alignment) -> float:
+    """Return by how much more than `LEAST_GAIN` a SLAT fits better without a layer.
+
+    Minus infinity where the layer is part of the object, or too little is left to tell.
+    """
     here, there = without.figures, found.figures
     if here is None or there is None:
-        return False
+        return -np.inf
     slat = here.score_slat - there.score_slat
     both = 0.5 * (slat + here.score_pixieverse - there.score_pixieverse)
-    return slat > -MOST_LOST and without.score - found.score + both > LEAST_GAIN
+    return without.score - found.score + both - LEAST_GAIN if slat > -MOST_LOST else -np.inf
+
+
+def _rounded(normal: Array, height: float) -> Ground:
+    rounded = np.rint(np.append(normal, height) / GRAIN) * GRAIN
+    return Ground(rounded[:3], float(rounded[3]))
 
 
 def _ends(points: Array) -> list[Array]:

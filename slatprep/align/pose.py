@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +72,7 @@ class Pose:
     perfect fit; ``fitness`` the share of samples within one voxel.
     ``bonus`` is what a trial deformation added to the score, where one was made;
     ``standing`` counts in the order of placements, and not in how far they are apart.
-    ``behind`` is by how many standard errors it fits worse than the best one, where that was asked.
+    ``behind`` is by how many standard errors it fits worse than the best one; NaN: not measured.
     """
 
     similarity: Similarity
@@ -80,7 +81,7 @@ class Pose:
     rmse: float = 0.0
     bonus: float = 0.0
     standing: float = 0.0
-    behind: float = 0.0
+    behind: float = nan
 
     @property
     def merit(self) -> float:

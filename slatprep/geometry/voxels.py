@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.records import RESOLUTION, Ground
 
 
@@ -48,16 +48,27 @@ def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return ~outside_of(occupancy)
 
 
+FOOT = 1.5
+"""So far below a ground's top, in voxels, what stands in it is taken to reach."""
+
+
 def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.bool_]:
     """Return the filled set's voxels above the ground; `occupancy` itself where there is none.
 
-    It is filled first, as what is hollow would be open where it stood on the ground.
+    It is filled first, as what is hollow would be open where it stood on the ground. What is
+    just above the ground goes on below its top, as far as `FOOT`.
     """
     if ground is None:
         return occupancy
     x, y, z = ground.normal[:, None] * voxel_centres(np.arange(RESOLUTION))
-    heights = x[:, None, None] + y[:, None] + z
-    higher: NDArray[np.bool_] = filled(occupancy) & (heights > ground.height)
+    depths = (ground.height - (x[:, None, None] + y[:, None] + z)) / VOXEL_SIZE
+    higher: NDArray[np.bool_] = filled(occupancy) & (depths < 0.0)
+    below = np.argwhere((depths >= 0.0) & (depths < FOOT))
+    steps = depths[tuple(below.T)] + 0.75
+    over = np.rint(below + steps[:, None] * ground.normal).astype(np.intp)
+    inside = ((over >= 0) & (over < RESOLUTION)).all(axis=1)
+    stands = higher[tuple(over[inside].T)]
+    higher[tuple(below[inside][stands].T)] = True
     return higher
 
 

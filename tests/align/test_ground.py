@@ -10,7 +10,7 @@ from support.shapes import GRID, chair, field_of, judged, surface_latents
 
 from slatprep.align import align
 from slatprep.align import field as engine
-from slatprep.align.ground import find_ground
+from slatprep.align.ground import find_layers
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
@@ -56,7 +56,7 @@ def test_an_object_on_ground_is_placed_as_without(thickness, degrees, radius, sc
 
 
 def test_the_top_of_a_slab_is_found():
-    ground = find_ground(surface_of(chair() | slab(3.0)))
+    ground = find_layers(surface_of(chair() | slab(3.0)))[0]
     np.testing.assert_allclose(ground.normal, [0, 0, 1], atol=0.01)
     # The slab's highest voxels have the index FOOT - 1; centres are half a voxel off.
     assert ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=0.75)
@@ -77,9 +77,25 @@ def test_the_lid_of_a_low_object_is_not_taken_for_its_ground(radius):
     latents = surface_latents(larger(board(), 1.1))
     field = field_of(board() | slab(2.0, radius=radius))
     found = align(field, latents, DEFAULT)
-    assert found.ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=1.5)
+    assert found.ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=2.5)
     true = make_transform(np.eye(3), scale=1.1)
     assert displacement(found.transform, true, latents.centres) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("thick", "sunk", "below", "radius", "within"),
+    [(3, 1, 1, np.inf, 0.5), (3, 2, 1, 25, 1.5), (4, 2, 2, np.inf, 1.2), (6, 2, 2, np.inf, 1.5)],
+)
+def test_a_rug_that_lies_in_the_ground_is_placed(thick, sunk, below, radius, within):
+    """What is cut off with the ground is drawn down again, or the rug would be half as thick."""
+    x, y, z = np.moveaxis(GRID, -1, 0)
+    rug = (abs(x - 31.5) < 16) & (abs(y - 31.5) < 11) & (z >= FOOT) & (z < FOOT + thick)
+    rug |= (abs(x - 22) < 5) & (abs(y - 36) < 4) & (z >= FOOT) & (z < FOOT + thick + 3)
+    ground = (z >= FOOT - below) & (z < FOOT + sunk) & (np.hypot(x - 31.5, y - 31.5) < radius)
+    latents = surface_latents(larger(rug, 1.3))
+    found = align(field_of(rug | ground), latents, DEFAULT)
+    true = make_transform(np.eye(3), scale=1.3)
+    assert displacement(found.transform, true, latents.centres) < within
 
 
 def test_a_flat_part_that_both_sides_have_is_no_ground():
@@ -91,7 +107,7 @@ def test_a_flat_part_that_both_sides_have_is_no_ground():
         blobs |= ((GRID - centre) ** 2).sum(axis=-1) < 16
     found = align(field_of(solid | blobs), latents, DEFAULT)
     assert found.score < engine.POOR
-    assert find_ground(surface_of(solid | blobs)) is not None
+    assert find_layers(surface_of(solid | blobs))
     assert found.ground is None
     assert displacement(found.transform, np.eye(4), latents.centres) < 2.0
 
@@ -100,7 +116,7 @@ def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch):
     def looked(_: object) -> None:
         raise AssertionError("looked for ground")
 
-    monkeypatch.setattr(engine, "find_ground", looked)
+    monkeypatch.setattr(engine, "find_layers", looked)
     found = align(field_of(chair()), surface_latents(chair()), DEFAULT)
     assert found.ground is None
 
@@ -109,7 +125,7 @@ def test_a_ball_a_slab_alone_and_a_few_voxels_have_no_ground():
     ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 400
     few = [(GRID >= [10, 20, 30]) & ([11, 21, 30 + count] > GRID) for count in (1, 2, 5)]
     for solid in (ball, slab(3.0), *(one.all(axis=-1) for one in few)):
-        assert find_ground(surface_of(solid)) is None
+        assert not find_layers(surface_of(solid))
 
 
 def test_quality_does_not_count_the_ground():
@@ -126,6 +142,8 @@ def test_a_hollow_object_stays_closed_without_its_ground():
     solid = bell.copy()
     bell[23:37, 23:37, 20:41] = False
     ground = Ground(np.array([0.0, 0.0, 1.0]), (FOOT - 0.5 - 31.5) / 64)
+    # It goes on for the layer whose centres are less than a voxel and a half below the top.
+    solid[20:40, 20:40, 19] = True
     np.testing.assert_array_equal(above(bell | slab(3.0), ground), solid)
     np.testing.assert_array_equal(above(bell, None), bell)
 
