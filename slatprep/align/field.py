@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from math import nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,9 @@ HOPELESS = 0.1
 WIDER_GAIN = 0.02
 """By so much a placement far from the quarter turns must score above the best near them."""
 
+WORSE = 0.02
+"""What scores by so much less once a layer is left out is not followed further."""
+
 CLOSE = 0.02
 """Deformed placements tie if they score less than this below the best, as scores tell more then."""
 
@@ -66,12 +70,21 @@ CLEARLY = 2.5
 """A placement that fits worse by so many standard errors does not tie, however close it scores."""
 
 
+class Candidates(NamedTuple):
+    """Placements best first, of the 24 starts as they were fitted, and of all orientations."""
+
+    poses: list[Pose]
+    fits: list[Pose]
+    wide: list[Pose]
+    halfway: list[Pose]
+
+
 def align(
     field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
 ) -> Alignment:
     """Align by distance fields; see `slatprep.align.align`."""
     pair = _pair_of(field, latents, parameters)
-    found = _search(pair)
+    found = _alignment(pair, _search(pair))
     return _above_ground(field, pair, found) if HOPELESS < found.score < POOR else found
 
 
@@ -83,7 +96,10 @@ def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignme
         if np.count_nonzero(solid) < LEAST_ABOVE * np.count_nonzero(field.occupancy):
             return found
         there = Pair(pair.slat, surface_of(solid), pair.parameters)
-        return replace(_search(there), ground=ground)
+        candidates = _search(there)
+        if candidates.poses[0].score < found.score - WORSE:
+            return found
+        return replace(_alignment(there, candidates), ground=ground)
 
     def gains(alignment: Alignment) -> float:
         return gain(alignment, found)
@@ -98,26 +114,23 @@ def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignme
     return best if gains(best) > 0.0 else found
 
 
-def _search(pair: Pair) -> Alignment:
-    parameters = pair.parameters
-    starts = distinct_starts()
-    fits = pair.refine(
-        pair.starts((s.rotation for s in starts), pair.size_ratio),
-        COARSE_SAMPLES,
-        COARSE_TAUS,
-        0.02,
-    )
+def _search(pair: Pair) -> Candidates:
+    starts = pair.starts((s.rotation for s in distinct_starts()), pair.size_ratio)
+    fits = pair.refine(starts, COARSE_SAMPLES, COARSE_TAUS, 0.02)
     poses = pair.polish(fits)
-    search = Search.EULER64
-    if _is_poor(poses):
-        search = Search.SO3
-        refined, halfway = search_all(pair)
-        wide = pair.polish(refined)
-        if wide[0].score > poses[0].score + WIDER_GAIN:
-            poses = pair.distinct([*poses, *wide])
-        if pair.may_deform and HOPELESS < poses[0].score < POOR:
-            poses = ranked(pair, pair.distinct([*poses, *wide]), halfway)
+    if not _is_poor(poses):
+        return Candidates(poses, fits, [], [])
+    refined, halfway = search_all(pair)
+    wide = pair.polish(refined)
+    if wide[0].score > poses[0].score + WIDER_GAIN:
+        poses = pair.distinct([*poses, *wide])
+    return Candidates(poses, fits, wide, halfway)
 
+
+def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
+    poses, fits, wide, halfway = candidates
+    if wide and pair.may_deform and HOPELESS < poses[0].score < POOR:
+        poses = ranked(pair, pair.distinct([*poses, *wide]), halfway)
     may_contest = pair.may_deform and poses[0].score < POOR
     reach, tie = (2 * TIE, CLOSE) if may_contest else (TIE, TIE)
     near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
@@ -126,14 +139,15 @@ def _search(pair: Pair) -> Alignment:
     # What was found of those near says more than the scores that they had before.
     others = pair.others(best, [*tied[1:], *(pose for pose in poses if pose not in near)])
 
-    fitted = {s.index: (fit.fitness, fit.rmse) for s, fit in zip(starts, fits, strict=True)}
+    starts = zip(distinct_starts(), fits, strict=True)
+    fitted = {start.index: (fit.fitness, fit.rmse) for start, fit in starts}
     transform = best.similarity.transform
     return Alignment(
         transform=transform,
         engine=Engine.FIELD,
         model=deformed.model,
-        search=search,
-        quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, parameters.radius),
+        search=Search.SO3 if wide else Search.EULER64,
+        quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, pair.parameters.radius),
         candidates=candidates_of(fitted),
         # The next one's score may come from fewer samples, and then be the higher one.
         margin=max(best.merit - others[0].merit, 0.0) if others else 1.0,

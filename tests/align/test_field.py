@@ -150,8 +150,8 @@ def test_the_search_looks_at_no_more_of_a_grid_full_of_voxels(monkeypatch):
 
     def counted(*given: Any) -> Any:
         slat, pixie, poses, taus = given[:4]
-        assert max(len(slat.points), len(pixie.points)) <= FINE_SAMPLES
-        work[-1] += (len(slat.points) + len(pixie.points)) * len(poses.scales) * len(taus)
+        assert max(len(slat.values), len(pixie.values)) <= FINE_SAMPLES
+        work[-1] += (len(slat.values) + len(pixie.values)) * len(poses.scales) * len(taus)
         return solve(*given)
 
     monkeypatch.setattr("slatprep.align.pair.solve", counted)
