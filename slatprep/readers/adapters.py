@@ -83,7 +83,7 @@ SOURCES = {
     "voxels": "slatprep.readers.voxels:PlainVoxels",
     "vomp": "slatprep.readers.voxels:VoMP",
     "physxnet": "slatprep.readers.physxnet:PhysXNet",
-    "parts": "slatprep.readers.parts:Parts",
+    "parts": "slatprep.readers.physxnet:Parts",
 }
 """slatprep's own source adapters."""
 

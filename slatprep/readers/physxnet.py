@@ -1,20 +1,30 @@
-"""PhysXNet as PhysX-3D's toolkit voxelises it: the density of TRELLIS's voxels of an object.
+"""PhysXNet and its kin: as PhysX-3D's toolkit voxelises it, and as objects of parts.
 
-Its ``voxelize.py`` writes the centres of an object's voxels to ``voxels/<id>.ply``. It writes
-a row of ``property/<id>2.npy`` for each of them: the object's largest dimension [cm], the
-part's rank in touching, its density [g/cm^3], its movement group and that group's parent,
-eight numbers of the movement, and its kind. ``property/<id>1.npy`` holds embeddings of text.
+The toolkit's ``voxelize.py`` writes the centres of an object's voxels, which are TRELLIS's, to
+``voxels/<id>.ply``. It writes a row of ``property/<id>2.npy`` for each of them: the object's
+largest dimension [cm], the part's rank in touching, its density [g/cm^3], its movement group and
+that group's parent, eight numbers of the movement, and its kind. ``property/<id>1.npy`` holds
+embeddings of text. PhysX-3D's ``tools/1_gptanno.py`` asks for the density in g/cm^3. A part's
+annotation reads ``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
 
-PhysX-3D's ``tools/1_gptanno.py`` asks for the density in g/cm^3. A part's annotation reads
-``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
+Objects of parts have no voxels: a JSON with the materials of each part, and a mesh of each.
+PhysXNet, PhysX-Mobility and PhysXVerse are published so: ``finaljson/<id>.json`` and
+``partseg/<id>/objs/<label>.obj``. PhysX-Anything's ``4_simready_gen.py`` reads of each part
+``density``, ``"Young's Modulus (GPa)"`` and ``"Poisson's Ratio"``, and its mesh at
+``objs/<label>/<label>.obj``.
 """
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import orjson
+from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
@@ -22,7 +32,7 @@ from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patt
 from slatprep.readers.files import ArraySpec, load_source, npy_array, require_complete
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import field_of_voxels
-from slatprep.records import PROPERTIES, AssetPair, MaterialField
+from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place
 from slatprep.storage.files import Listing
 
 _ROWS = ArraySpec(shapes=((None, 14),), kinds="f", note=", as PhysX-3D's toolkit writes it")
@@ -83,3 +93,152 @@ class PhysXNet:
             frame=np.eye(4),
             roots=pair.roots,
         )
+
+
+_KEYS: dict[str, tuple[str, float, dict[str, float]]] = {
+    "youngs_modulus": ("Young's Modulus (GPa)", 1e9, {"gpa": 1e9}),
+    "density": ("density", 1e3, {"g/cm^3": 1e3, "g/cm³": 1e3, "kg/m^3": 1.0, "kg/m³": 1.0}),
+    "poissons_ratio": ("Poisson's Ratio", 1.0, {}),
+}
+"""The key of each property, and in SI units: a bare number of it, units behind a number."""
+
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", re.S)
+_MAX_PARTS = 1000
+
+
+class Parts:
+    """``finaljson/<id>.json`` and the meshes of its parts, voxelised solid on 64^3."""
+
+    patterns = ("finaljson/{id}.json",)
+
+    def describe(self, source: PixieverseSource) -> Holding:
+        """Say that there are PixieVerse's three properties, and no classes."""
+        _trimesh()
+        return Holding(PROPERTIES, ())
+
+    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
+        """Find the fields by the names of their JSON files."""
+        for found in find_by_pattern(patterns_of(self, source), listing, {}):
+            yield replace(found, beside=tuple(_meshes_of(found.object_id, listing).values()))
+
+    def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
+        """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
+        path, _ = require_complete(pair)
+        root, units = pair.roots.pixieverse, pair.roots.units
+        data, file = load_source(path, root, "grid")
+        rows = _parts_of(data, path)
+        stated = {name for name in _KEYS if units.of(name)}
+        values = [[_number(part, name, name in stated, path) for name in _KEYS] for part in rows]
+        read = {one.name[:-4]: (one, *load_source(one, root, "description")) for one in pair.beside}
+        meshes = []
+        for label in (str(part["label"]) for part in rows):
+            if label not in read:
+                expected = " or ".join(_names(path.name.removesuffix(".json"), label))
+                raise InputError(path, f"part {label} has no mesh", expected)
+            meshes.append(_mesh(*read[label][:2]))
+        voxels, owner = _voxels(meshes, path)
+        return field_of_voxels(
+            path,
+            voxels,
+            np.array(values)[owner],
+            max_unphysical=max_unphysical,
+            sources=(file, *(source for _, _, source in read.values())),
+            roots=pair.roots,
+        )
+
+
+def _parts_of(data: bytes, path: Place) -> list[dict[str, Any]]:
+    """Return the parts of a JSON, each with a label."""
+    try:
+        parts = orjson.loads(data)["parts"]
+        if not all(isinstance(part["label"], int) for part in parts):
+            raise TypeError
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            path,
+            f"is no annotation of parts ({error})",
+            'an object with "parts", each with "label"',
+        ) from None
+    if not 0 < len(parts) <= _MAX_PARTS:
+        raise InputError(path, f"has {len(parts)} parts", f"1 to {_MAX_PARTS}")
+    return list(parts)
+
+
+def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float:
+    """Return a property of a part in SI units, or as it is where the definition states a unit."""
+    key, bare, units = _KEYS[name]
+    given = part.get(key)
+    match = _NUMBER.fullmatch(str(given))
+    unit = match[2].strip().lower() if match else "?"
+    known = {"": bare, **units}
+    if match is None or unit not in known:
+        expected = " or ".join(["a number", *units])
+        raise InputError(path, f"part {part['label']} has {key} {given!r}", expected)
+    return float(match[1]) * (1.0 if stated else known[unit])
+
+
+def _names(name: str, label: str) -> tuple[str, str]:
+    """Return where the mesh of a part of an object may lie."""
+    return f"partseg/{name}/objs/{label}.obj", f"partseg/{name}/objs/{label}/{label}.obj"
+
+
+def _meshes_of(name: str, listing: Listing) -> dict[str, str]:
+    """Return the meshes of an object by label, also those of no part."""
+    folder = f"partseg/{name}/objs/"
+    files = listing.of_folder(folder, folders=False)
+    found = {file[:-4]: folder + file for file in sorted(files) if file.endswith(".obj")}
+    for label in sorted(listing.of_folder(folder, folders=True)):
+        nested = _names(name, label)[1]
+        if label not in found and listing.is_file(nested):
+            found[label] = nested
+    return found
+
+
+def _mesh(path: Place, data: bytes) -> Any:
+    """Return the mesh of a part."""
+    try:
+        mesh = _trimesh().load(
+            io.BytesIO(data), file_type="obj", force="mesh", process=False, skip_materials=True
+        )
+        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+            raise ValueError("it has no faces, or vertices that are not finite")
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        raise InputError(path, f"is no mesh ({error})", "an OBJ with faces") from None
+    return mesh
+
+
+def _voxels(meshes: list[Any], path: Place) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Voxelise the parts, filled: voxels (K, 3) of 64^3, each once, and the part of each.
+
+    The object's longest side spans the cube, as in TRELLIS's toolkit. Where parts overlap the
+    smaller one counts, such as what lies inside a shell.
+    """
+    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
+    high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
+    side = float((high - low).max())
+    if not side > 0:
+        raise InputError(path, "has parts without any size", "meshes of a solid")
+    owner = np.full((RESOLUTION,) * 3, -1, dtype=np.intp)
+    filled = []
+    for mesh in meshes:
+        moved = mesh.copy()
+        # Cell i spans i - 0.5 to i + 0.5 in the library's grid of pitch 1.
+        scaled = (mesh.vertices - (low + high) / 2) / side * (RESOLUTION - 1e-6)
+        moved.vertices = scaled + (RESOLUTION - 1) / 2
+        cells = np.rint(moved.voxelized(pitch=1.0).fill().points).astype(np.int64)
+        filled.append(np.unique(np.clip(cells, 0, RESOLUTION - 1), axis=0))
+    for number in sorted(range(len(meshes)), key=lambda number: -len(filled[number])):
+        owner[tuple(filled[number].T)] = number
+    voxels = np.argwhere(owner >= 0)
+    return voxels, owner[tuple(voxels.T)]
+
+
+def _trimesh() -> Any:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ConfigError(
+            "meshes of parts need the package trimesh; install it with "
+            "`pip install 'slatprep[parts]'`"
+        ) from error
+    return trimesh
