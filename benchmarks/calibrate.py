@@ -21,7 +21,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,8 +34,8 @@ from scipy.special import expit
 
 from slatprep.align.pair import TIE
 from slatprep.judge import calibration
-from slatprep.judge.confidence import VOXEL_FIGURES, voxel_figures
-from slatprep.judge.evidence import FIGURES, HARMLESS, Surroundings
+from slatprep.judge.confidence import voxel_figures
+from slatprep.judge.evidence import FIGURES, HARMLESS, VOXEL_FIGURES, Surroundings
 from slatprep.judge.model import Figure, Logistic
 from slatprep.judge.verdict import THRESHOLDS
 
@@ -185,7 +185,8 @@ def fit(
         Figure(name, *(float(f"{v:.6g}") for v in (w / s, u, a, b)))
         for name, w, s, u, a, b in zip(names, found[:-1], spread, usual, low, high, strict=True)
     )
-    return Logistic(figures, float(f"{found[-1]:.6g}"), ())
+    counted = tuple(figure for figure in figures if figure.weight)
+    return Logistic(tuple(dict.fromkeys(names)), counted, float(f"{found[-1]:.6g}"), ())
 
 
 def _bounds(sign: float, free: bool) -> tuple[float | None, float | None]:
@@ -225,7 +226,7 @@ def with_curve(
     share = np.bincount(bins, weights * right) / total
     share = isotonic_regression(share, weights=total).x
     curve = tuple((float(f"{a:.5g}"), float(f"{s:.5g}")) for a, s in zip(at, share, strict=True))
-    return Logistic(model.figures, model.intercept, curve)
+    return replace(model, curve=curve)
 
 
 def fit_all(table: Table) -> Models:
@@ -412,16 +413,21 @@ def write_module(path: Path, models: Models) -> None:
     """Write the numbers as a module, so that they are part of the code that makes a store."""
     lines = [
         '"""The weights of the confidences; written by benchmarks/calibrate.py, not by hand."""',
-        "", "from slatprep.judge.model import Figure, Logistic", "",
-        f"SAME_OBJECT = {models.same!r}",
+        "", "from slatprep.judge.evidence import FIGURES, VOXEL_FIGURES",
+        "from slatprep.judge.model import Figure, Logistic", "",
+        f"SAME_OBJECT = {_written(models.same, 'FIGURES')}",
         '"""Whether both sides show the same object."""', "",
-        f"PLACEMENT = {models.placement!r}",
+        f"PLACEMENT = {_written(models.placement, 'FIGURES')}",
         '"""Whether a placement is right, of the same object."""', "",
-        f"VOXEL = {models.voxel!r}",
+        f"VOXEL = {_written(models.voxel, 'VOXEL_FIGURES')}",
         '"""Whether the class of a voxel is right."""',
     ]  # fmt: skip
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     subprocess.run([sys.executable, "-m", "ruff", "format", "-q", path], check=True)
+
+
+def _written(model: Logistic, names: str) -> str:
+    return f"Logistic({names}, {repr(model).removeprefix('Logistic(')}"
 
 
 if __name__ == "__main__":

@@ -7,22 +7,8 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
-from slatprep.judge.evidence import FIGURES, RADII, Surroundings
+from slatprep.judge.evidence import FIGURES, Surroundings
 from slatprep.judge.model import FLOOR
-
-VOXEL_FIGURES = (
-    *(f"others_{radius}" for radius in RADII),
-    *(f"others_{radius}_rough" for radius in RADII),
-    *(f"others_{radius}_unsure" for radius in RADII),
-    "distance",
-    "depth",
-    "moved",
-    "asset_unsure",
-    "asset_rough",
-    "asset_distance",
-    "asset_moved",
-)
-"""The figures of a voxel, in the order of `voxel_figures`."""
 
 _CAUSES = {
     "shape": ("moved", "moved_most", "bending", "stretch", "scale", "within_2", "within_3",

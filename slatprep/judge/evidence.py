@@ -61,6 +61,20 @@ FIGURES = (
 RADII = (1, 2, 4, 7)
 """Distances [voxel] at which the classes around a voxel's place are looked at."""
 
+VOXEL_FIGURES = (
+    *(f"others_{radius}" for radius in RADII),
+    *(f"others_{radius}_rough" for radius in RADII),
+    *(f"others_{radius}_unsure" for radius in RADII),
+    "distance",
+    "depth",
+    "moved",
+    "asset_unsure",
+    "asset_rough",
+    "asset_distance",
+    "asset_moved",
+)
+"""The figures of a voxel, in the order of `confidence.voxel_figures`."""
+
 MARGIN_CAP = 0.3
 """Margins above this say no more."""
 

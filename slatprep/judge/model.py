@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -35,26 +35,24 @@ class Logistic:
 
     Attributes
     ----------
+    names : tuple of str
+        The figures that values have, in their order.
     figures : tuple of Figure
-        What it looks at; those of one name stand together.
+        What counts of them; those of one name stand together.
     intercept : float
         Logarithm of the odds where all figures are as usual.
     curve : tuple of (float, float)
         Logarithm of the odds, and share of right ones found there; straight in between.
     """
 
+    names: tuple[str, ...] = field(repr=False)
     figures: tuple[Figure, ...]
     intercept: float
     curve: tuple[tuple[float, float], ...]
 
     @cached_property
-    def names(self) -> tuple[str, ...]:
-        """The figures it looks at, in the order of values."""
-        return tuple(dict.fromkeys(figure.name for figure in self.figures))
-
-    @cached_property
-    def _columns(self) -> list[int]:
-        return [self.names.index(figure.name) for figure in self.figures]
+    def _columns(self) -> NDArray[np.intp]:
+        return np.array([self.names.index(figure.name) for figure in self.figures])
 
     @cached_property
     def _table(self) -> NDArray[np.float64]:
@@ -63,9 +61,10 @@ class Logistic:
     def contributions(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return what each figure (..., F) adds to the logarithm of the odds; NaN adds nothing."""
         weight, usual, low, high = self._table
-        parts = weight * (np.clip(values[..., self._columns], low, high) - usual)
-        first = [self._columns.index(k) for k in range(len(self.names))]
-        added: NDArray[np.float64] = np.add.reduceat(np.nan_to_num(parts), first, axis=-1)
+        parts = np.nan_to_num(weight * (np.clip(values[..., self._columns], low, high) - usual))
+        added = np.zeros(values.shape)
+        for column, part in zip(self._columns, np.moveaxis(parts, -1, 0), strict=True):
+            added[..., column] += part
         return added
 
     def probability(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -73,14 +72,8 @@ class Logistic:
         from slatprep.judge.odds import add_odds
 
         odds = np.full(values.shape[:-1], self.intercept)
-        # Those of no weight need not be looked at: there may be thousands of rows.
-        counted = self._table[0] != 0.0
-        add_odds(
-            values.reshape(-1, values.shape[-1]),
-            np.array(self._columns)[counted],
-            self._table[:, counted].astype(values.dtype),
-            odds.reshape(-1),
-        )
+        rows = values.reshape(-1, values.shape[-1])
+        add_odds(rows, self._columns, self._table.astype(values.dtype), odds.reshape(-1))
         return self.calibrated(odds)
 
     def calibrated(self, odds: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,6 +17,8 @@ def _ends(name: str) -> tuple[float, float]:
     """Return a figure's value for usual right ones, and for the worst that the model knows."""
     model = PLACEMENT if name in OF_PLACEMENT else SAME_OBJECT
     own = [figure for figure in model.figures if figure.name == name]
+    if not own:
+        return 0.0, 0.0  # It counts for nothing.
     usual = next((f.usual for f in own if f.low < f.usual < f.high), own[0].usual)
     low, high = own[0].low, own[-1].high
     return usual, (low if usual - low > high - usual else high)

@@ -9,10 +9,11 @@ from support.shapes import GRID, field_of, latents_of, surface_latents
 
 from slatprep.align.figures import measure_figures
 from slatprep.geometry.frames import make_transform
-from slatprep.judge.confidence import VOXEL_FIGURES, class_confidence, voxel_figures
+from slatprep.judge.confidence import class_confidence, voxel_figures
 from slatprep.judge.evidence import (
     FIGURES,
     HARMLESS,
+    VOXEL_FIGURES,
     Surroundings,
     _labels_of,
     evidence_of,

@@ -208,7 +208,8 @@ def test_samples_without_any_label_are_right_nowhere(confidence: list[float] | N
 
 
 def test_what_takes_confidence_away_is_summed_by_cause_largest_first() -> None:
-    usual = np.array([[f.usual for f in SAME_OBJECT.figures if f.name == n][-1] for n in FIGURES])
+    own = {figure.name: figure.usual for figure in SAME_OBJECT.figures}
+    usual = np.array([own.get(name, 1.0) for name in FIGURES])
     rng = np.random.default_rng(1)
     for _ in range(20):
         figures = usual * rng.uniform(0.3, 1.7, len(FIGURES))
