@@ -123,9 +123,10 @@ def test_voxels_without_an_answer_are_not_asked(tmp_path):
     longer = np.array([[x, 32, 32] for x in range(20, 44)])
     true_material = np.concatenate([ROD_MATERIAL, np.full(4, 5)]).astype(np.uint8)
     stored = np.concatenate([ROD_MATERIAL, [0, 5, 0, 0]]).astype(np.uint8)
-    asset = rod_asset(coords=longer, material=stored, valid=np.ones(24, dtype=bool))
+    asset = rod_asset(coords=longer, material=stored, valid=np.arange(24) < 23)
     score = scored(tmp_path, asset, material=true_material)
     assert score.label_accuracy == pytest.approx(21 / 22)
+    assert score.valid_share == pytest.approx(23 / 24)
 
 
 def test_unannotated_voxels_are_no_answer(tmp_path):
@@ -196,6 +197,7 @@ def test_displacement_is_from_the_true_places(tmp_path):
     (score,) = score_against_truth(tmp_path / "s.zarr", tmp_path / "truth").assets
     # Back by five voxels, voxels 30 to 34 ask for the other material.
     assert score.similarity_accuracy == pytest.approx(35 / 40)
+    assert score.truth_own == 1.0
     assert score.displacement == pytest.approx(apart.mean())
     moved = np.abs(LONG[:, 0] + 0.5 - 5 - (LONG[:, 0] + 0.5) / 2 - 15)
     assert score.similarity_displacement == pytest.approx(moved.mean())

@@ -165,6 +165,8 @@ def test_classes_of_a_source_s_own_are_told_by_their_names(tmp_path):
     build_store(parameters_of(tmp_path), out)
     store = open_store(out)
     assert store.attributes["material_classes"] == own
+    assert store.contents.n_classes == 2
+    assert not verify_store(out).findings
     found = store_statistics(store)
     counts = np.sum([np.bincount(voxels_of(seed)[2]) for seed in range(2)], axis=0)
     assert [one.name for one in found.classes] == own

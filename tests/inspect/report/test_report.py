@@ -25,7 +25,7 @@ from slatprep.inspect import report
 from slatprep.inspect.overview import overview_of
 from slatprep.inspect.report import write_report
 from slatprep.inspect.report.content import nearest_quarter_turn, quarter_turns
-from slatprep.inspect.report.outcomes import kind_of, kinds_of
+from slatprep.inspect.report.outcomes import kinds_of
 from slatprep.store import open_store
 
 IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]
@@ -264,18 +264,6 @@ def test_other_records_are_refused(hostile, tmp_path, text):
     with pytest.raises(StoreError, match=r"build\.json: not a record"):
         write_report(open_store(hostile.store), tmp_path / "page.html", manifests=tmp_path)
     assert not (tmp_path / "page.html").exists()
-
-
-@pytest.mark.parametrize(
-    ("reason", "kind"),
-    [
-        ("only 76.1% of it lies within 1 voxel", "only N% of it lies within N voxel"),
-        ("a/b.npz: holds 1,024 rows; expected 3", "holds N rows"),
-        ("internal error, please report: KeyError: 'x'", None),
-    ],
-)
-def test_reasons_are_grouped_without_files_and_numbers(reason, kind):
-    assert kind_of(reason) == (reason if kind is None else kind)
 
 
 def test_numbers_that_all_reasons_of_a_kind_share_are_kept():
