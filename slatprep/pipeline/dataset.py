@@ -7,7 +7,7 @@ dataset, for what is new or changed, and replaces the store in one step.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -152,7 +152,9 @@ def build_store(
         before = before.checked(crew.of(len(pairs)))
         context = BuildContext(parameters, recipe, work.spool, before.previous, strict)
         plan = _plan(pairs, context, crew, before.known)
-        new, unchanged = _split(pairs, plan)
+        # The alignment of those that are unchanged is in the store.
+        unchanged = [pair for pair in pairs if plan[pair.asset_id].action is Action.REUSE]
+        new = [pair for pair in pairs if plan[pair.asset_id].action is not Action.REUSE]
         made = finish(new, plan, context, crew)
         kept = []
         if not keep_work:
@@ -268,20 +270,19 @@ def align_pairs(
         pairs = _discover(parameters, jobs, work.scratch, note=note)
         plan = _plan(pairs, context, crew)
         assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
-        texts = ((asset.asset_id, _text_of(asset, work.spool)) for asset in assets)
         digests = []
         with writing(str(out), out.parent), staged(out) as partial, partial.open("wb") as file:
-            for asset_id, text in texts:
+            for asset in assets:
+                if isinstance(asset, FailedRecord):
+                    text = to_json(asset)
+                else:
+                    text = work.spool.record_text(asset.key)
                 file.write(text + b"\n")
-                digests.append((asset_id, digest_of(text)))
+                digests.append((asset.asset_id, digest_of(text)))
     failed = [asset for asset in assets if isinstance(asset, FailedRecord)]
     counts = counts_of(asset for asset in assets if isinstance(asset, Row))
     build_id = build_id_of(parameters.name, digests)
     return summarise(counts, failed, out, build_id, time.perf_counter() - begin)
-
-
-def _text_of(asset: Row | FailedRecord, spool: Spool) -> bytes:
-    return to_json(asset) if isinstance(asset, FailedRecord) else spool.record_text(asset.key)
 
 
 def _discover(
@@ -305,16 +306,6 @@ def _plan(
     if context.previous is None and not context.spool.holds_any():
         return {p.asset_id: PlannedAsset(p.asset_id, Action.ALIGN, "new") for p in pairs}
     return {asset.asset_id: asset for asset in plan_assets(pairs, context, crew, known)}
-
-
-def _split(
-    pairs: Iterable[AssetPair], plan: Mapping[str, PlannedAsset]
-) -> tuple[list[AssetPair], list[AssetPair]]:
-    """Return the pairs that are new or changed, and those whose alignment is in the store."""
-    split: tuple[list[AssetPair], list[AssetPair]] = ([], [])
-    for pair in pairs:
-        split[plan[pair.asset_id].action is Action.REUSE].append(pair)
-    return split
 
 
 def _publish(

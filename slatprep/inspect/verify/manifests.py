@@ -44,11 +44,8 @@ def source_roots(manifests: Place | None) -> SourceRoots:
     except (OSError, StoreError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
     if not gone:
-        first, *also = [
-            SourceRoots(locate_grids(source), slat, adapter=source.adapter, number=number)
-            for number, source in enumerate(sources)
-        ]
-        return replace(first, also=tuple(also))
+        first, *also = [SourceRoots(one.root, slat, number=k) for k, one in enumerate(sources)]
+        return moved(replace(first, also=tuple(also)), manifests)
     text = str(build.parameters.pixieverse.root)
     if APART in text:
         raise StoreError(
