@@ -57,11 +57,6 @@ def test_the_version_is_that_of_the_package():
     assert slatprep.__version__ == importlib.metadata.version("slatprep")
 
 
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="open_stoer"):
-        slatprep.open_stoer  # noqa: B018
-
-
 @pytest.mark.parametrize("name", MODULES)
 def test_doctests_run(name):
     failed, _ = doctest.testmod(importlib.import_module(name))

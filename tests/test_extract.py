@@ -20,8 +20,6 @@ from support.synthetic import make_asset
 
 from slatprep import extract as work
 from slatprep.errors import ConfigError, InputError
-from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.pipeline.dataset import build_store
 
 MEAN, STD = [0.5] * 8, [2.0] * 8
 
@@ -145,24 +143,6 @@ def test_latents_and_their_record_are_what_the_pipeline_returns(session, images,
     assert record["sparse_structure_sampler_params"]["cfg_strength"] == 7.5
     for key, file in (("image", images[0]), ("slat", tmp_path / "slat" / "cup.npz")):
         assert record[key]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def test_build_store_reads_what_is_extracted(session, images, tmp_path):
-    assert len(run(session, images, tmp_path / "slat", 0, 1)) == 4
-    for name in ("cup", "bear"):
-        grid = tmp_path / "pixieverse" / name / "sample_0" / "material_grid.npy"
-        grid.parent.mkdir(parents=True)
-        np.save(grid, make_asset(0).grid)
-    summary = build_store(
-        BuildParameters(PixieverseSource(tmp_path / "pixieverse"), SlatSource(tmp_path / "slat")),
-        tmp_path / "s.zarr",
-    )
-    from slatprep.store import open_store
-
-    store = open_store(summary.store)
-    assert store.ids == ["bear.seed-0", "bear.seed-1", "cup.seed-0", "cup.seed-1"]
-    with np.load(tmp_path / "slat" / "cup" / "seed-1.npz") as saved:
-        np.testing.assert_array_equal(store.asset("cup.seed-1").feats, saved["feats"])
 
 
 def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(session, images, tmp_path):

@@ -16,7 +16,6 @@ from slatprep.normalize import (
     from_mapped,
     normalize_and_count,
     normalize_change,
-    normalize_mapped,
     normalize_properties,
     property_extent,
     ranges_from_extents,
@@ -50,12 +49,6 @@ def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted():
     np.testing.assert_array_equal(values[:2], [[-1, -1, -1], [1, 1, 1]])
     np.testing.assert_allclose(values[2:], [[-1, 1, 0], [1, 0, 1]], atol=1e-6)
     assert clipped.tolist() == [2, 1, 1]
-
-
-def test_mapped_values_by_hand_are_not_clipped():
-    # 13 lies a decade above 4..12, an eighth of its width: 1 + 2 / 8.
-    values = normalize_mapped([[6.0, 3.0, 0.35], [13.0, 1.0, 0.5]], DECADES)
-    np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5], [1.25, -2.0, 2.0]], atol=1e-12)
 
 
 def test_properties_are_mapped_and_brought_back_by_hand():

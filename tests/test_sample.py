@@ -41,26 +41,6 @@ def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
         assert found.properties.dtype == found.distance.dtype == np.float32
 
 
-def test_voxels_are_carried_by_the_inverse_transform():
-    # (x, y, z) -> (-y, x, z): field voxel (20, 10, 10) lies at SLAT (53, 20, 10).
-    turn = make_transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    found = sample(_field(), places_of(voxel_centres([[53, 20, 10]]), turn), NEAREST)
-    assert found.material.tolist() == [4]
-    assert found.distance.tolist() == [0.0]
-
-
-def test_distances_are_in_voxels_of_the_pixieverse_frame():
-    # Magnified twice about the cube's centre, SLAT voxel 31 looks at 31.25.
-    voxels = np.array([[31, 31, 31]], dtype=np.uint8)
-    occupancy = np.zeros((64, 64, 64), dtype=bool)
-    occupancy[31, 31, 31] = True
-    field = MaterialField(occupancy, voxels, np.ones(1, np.uint8), np.ones((1, 3), np.float32))
-    found = sample(
-        field, places_of(voxel_centres(voxels), make_transform(np.eye(3), scale=2.0)), NEAREST
-    )
-    np.testing.assert_allclose(found.distance, [np.sqrt(3) / 4], rtol=1e-6)
-
-
 def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values():
     # One voxel of class 0 in a block of class 3: looked at slightly off its
     # centre, its neighbours outvote it.

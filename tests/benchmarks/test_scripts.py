@@ -16,7 +16,7 @@ from support.deformed import MOVES, occupancy
 from support.shapes import field_of, surface_latents
 
 from slatprep.demo import make_demo
-from slatprep.errors import SlatprepError, StoreError
+from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.store import open_store
 
@@ -133,15 +133,3 @@ def test_every_way_reads_every_asset_alike(mixed_build, tmp_path):
             assert np.array_equal(arrays["coords"], asset.coords)
             assert np.array_equal(arrays["feats"], asset.feats)
             assert np.array_equal(arrays["properties"], asset.properties, equal_nan=True)
-
-
-def test_a_way_that_reads_something_else_is_not_measured(mixed_build, tmp_path, monkeypatch):
-    right = next(way for way in read.WAYS if way.name == "npz")
-
-    def others(directory: Path) -> read.Reader:
-        reader = right.open(directory)
-        return lambda row: {**reader(row), "coords": reader(row)["coords"] + 1}
-
-    monkeypatch.setattr(read, "WAYS", (read.Way("npz", others, "npz"),))
-    with pytest.raises(StoreError, match=r"npz reads other coords of asset \d+ than slatprep does"):
-        read.bench_read(mixed_build.store, tmp_path, repeats=1)

@@ -116,22 +116,6 @@ def test_entry_holds_libraries_to_one_thread():
 # -- end to end ---------------------------------------------------------------
 
 
-def test_what_one_command_writes_the_others_read(demo):
-    store = demo / "demo.zarr"
-    ids = ids_of(store)
-    assert len(ids) == 3
-    described = document("info", store, "-q")
-    assert described["total"]["assets"] == 3
-    offsets = zarr.open_group(store, mode="r")["asset/offset"][:]
-    assert described["total"]["voxels"] == int(offsets[-1])
-    assert sum(group["assets"] for group in described["categories"]) == 3
-
-    scored = document("score", store, demo / "demo" / "truth")
-    assert [row["asset_id"] for row in scored["assets"]] == ids
-    assert scored["missing"] == []
-    run("check-alignment", "--asset", ids[0], "--store", store)
-
-
 def test_align_writes_one_record_an_asset(demo):
     out, sources = demo / "alignments.jsonl", demo / "demo"
     words = ("--pixieverse", sources / "pixieverse", "--slat", sources / "slat", "--out", out, "-q")

@@ -171,20 +171,6 @@ def test_the_solid_is_read_back_by_the_adapter_for_vomp_s_data(store, mixed, tmp
         np.testing.assert_allclose(values, [modulus, density, ratio], rtol=1e-4)
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.5])
-def test_the_adapter_takes_corners_of_the_dataset_and_centres_of_predictions(offset, tmp_path):
-    voxels = np.arange(64)[:, None] * np.ones(3, int)
-    names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
-    rows = np.zeros(64, dtype=[(name, "<f4") for name in names])
-    for name, column in zip(names[:3], ((voxels + offset) / 64 - 0.5).T, strict=True):
-        rows[name] = column
-    rows["youngs_modulus"], rows["poissons_ratio"], rows["density"] = 1e6, 0.3, 1000 + voxels[:, 0]
-    (tmp_path / "gvm").mkdir()
-    np.savez(tmp_path / "gvm" / "a_with_materials.npz", voxel_data=rows)
-    field = field_at(tmp_path / "gvm", "a")
-    np.testing.assert_allclose(field.properties[:, 1], 1000.0 + field.voxels[:, 0])
-
-
 def test_points_may_be_chosen_for_voxel_data_and_the_frame_may_not(store, tmp_path):
     words = (store, "--format", "voxel_data", "--frame", "slat", "--out", tmp_path / "o")
     assert "--frame is for --format ply, not voxel_data" in refused("export", *words)

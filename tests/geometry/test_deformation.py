@@ -7,7 +7,6 @@ import orjson
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.shapes import chair, field_of, surface_latents
 
 from slatprep.geometry.bspline import refined
 from slatprep.geometry.deformation import (
@@ -22,10 +21,8 @@ from slatprep.geometry.deformation import (
     make_deformation,
     undeform,
 )
-from slatprep.geometry.frames import make_transform, places_of
-from slatprep.parameters import SampleParameters
+from slatprep.geometry.frames import make_transform
 from slatprep.records import Deformation
-from slatprep.sample import sample
 from slatprep.store.record_json import adapter_of
 
 BOX = np.array([[-0.5] * 3, [0.5] * 3])
@@ -214,15 +211,3 @@ def test_only_bending_bends():
     twisted = np.zeros((8, 8, 8, 3))
     twisted[..., 2] = 64 * 0.01 * np.multiply.outer(index * 0.1, index * 0.1)[:, :, None]
     assert bending_of(replace(made, coefficients=twisted)) == pytest.approx(0.01 * np.sqrt(2))
-
-
-def test_the_lookup_goes_through_the_map():
-    solid = chair()
-    field, latents = field_of(solid), surface_latents(solid)
-    way = PlaceMap(np.eye(4), bent(voxels=1.0))
-    through = sample(field, way.places(latents.coords), SampleParameters())
-    assert through.place.tobytes() == way.places(latents.coords).astype(np.float32).tobytes()
-    plain = sample(field, places_of(latents.centres, np.eye(4)), SampleParameters())
-    none = sample(field, PlaceMap(np.eye(4)).places(latents.coords), SampleParameters())
-    assert plain.distance.tobytes() == none.distance.tobytes()
-    assert plain.distance.tobytes() != through.distance.tobytes()

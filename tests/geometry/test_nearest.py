@@ -141,7 +141,8 @@ def test_of_a_drawn_vote_the_lower_label_wins():
 def test_votes_are_those_of_a_plain_count(seed, width):
     rng = np.random.default_rng(seed)
     voxels = np.unique(rng.integers(20, 26, (80, 3)), axis=0).astype(np.uint8)
-    labels = rng.integers(0, 7, len(voxels)).astype(np.uint8)
+    # On one side all are alike, so that there is a border.
+    labels = np.where(voxels[:, 0] > 22, 3, rng.integers(0, 7, len(voxels))).astype(np.uint8)
     points = voxel_centres(rng.integers(19, 27, (20, 3))) + rng.uniform(-0.5, 0.5, (20, 3)) / 64
     distances, spokesmen, _ = Lattice(voxels).voted(points, labels, width, np.inf)
     for point, spokesman, distance in zip(points, spokesmen, distances, strict=True):

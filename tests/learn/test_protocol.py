@@ -98,20 +98,6 @@ def test_steps_end_where_they_are_told_to(learn_store, tmp_path, steps):
     assert seen == [(k, done) for k in range(done + 1)]
 
 
-def test_a_run_of_steps_goes_on_to_the_bit(learn_store, tmp_path):
-    chosen = TrainParameters(
-        size="tiny", steps=5, batch_size=2, learning_rate=2e-3, shares=Shares(0.4, 0.3, 0.3)
-    )
-    train(learn_store, tmp_path / "whole", chosen)
-    train(learn_store, tmp_path / "parts", chosen, stop_after=1)
-    train(learn_store, tmp_path / "parts", chosen)
-    whole, parts = (
-        torch.load(tmp_path / name / LAST, weights_only=True)["model"]
-        for name in ("whole", "parts")
-    )
-    assert all(torch.equal(whole[key], parts[key]) for key in whole)
-
-
 def test_the_last_weights_need_no_validation(learn_store, tmp_path):
     shares = Shares(0.9, 0.0, 0.1)
     two = TrainParameters(size="tiny", epochs=2, learning_rate=2e-3, shares=shares, keep="last")
