@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +16,8 @@ from support.commands import document, parse_command, refused, run
 from support.trees import tree
 
 from slatprep.cli.commands import COMMANDS
+from slatprep.errors import ConfigError
+from slatprep.parameters import PRESETS, BuildParameters
 
 THREE_ASSETS = ("--assets", "3", "--seed", "3", "--level", "0")
 
@@ -126,23 +127,17 @@ def test_align_writes_one_record_an_asset(demo):
     np.testing.assert_array_equal([r["alignment"]["transform"] for r in records], stored)
 
 
-def test_preset_paper_is_the_protocol_on_open3d(demo, tmp_path):
-    grid = next((demo / "demo" / "pixieverse").iterdir())
-    shutil.copytree(grid, tmp_path / "pixieverse" / grid.name)
-    out = tmp_path / "paper.jsonl"
-    result = run(
-        "align", "--pixieverse", tmp_path / "pixieverse", "--slat", demo / "demo" / "slat",
-        "--preset", "paper", "--out", out, "-q", code=1,  # the other objects are not there
-    )  # fmt: skip
-    by_status: dict[str, list[dict[str, Any]]] = {}
-    for record in map(json.loads, out.read_text().splitlines()):
-        by_status.setdefault(record["status"], []).append(record)
-    (aligned,) = by_status["ok"]
-    assert aligned["asset_id"] == grid.name
-    assert aligned["alignment"]["engine"] == "open3d"
-    assert len(aligned["alignment"]["candidates"]) == 64
-    assert len(by_status["skipped"]) == 2
-    assert len(result.stderr.splitlines()) == 2
+def test_preset_paper_is_asked_of_the_build(demo, monkeypatch):
+    asked: list[BuildParameters] = []
+
+    def stop(parameters: BuildParameters, *_: object, **__: object) -> None:
+        asked.append(parameters)
+        raise ConfigError("far enough")
+
+    monkeypatch.setattr("slatprep.pipeline.dataset.align_pairs", stop)
+    words = ("--config", demo / "demo" / "dataset.toml", "--out", demo / "paper.jsonl")
+    assert "far enough" in refused("align", *words, "--preset", "paper")
+    assert asked[0].align == PRESETS["paper"].align
 
 
 def test_options_win_over_the_dataset_definition(demo):
