@@ -176,6 +176,9 @@ def _columns(row):  # type: ignore[no-untyped-def]
     size = row.shape[0]
     for i in range(size):
         for j in range(size):
+            slab[j, :] = NOTHING * NOTHING
+            if row[i, j].max() < 0:  # as of most lines
+                continue
             last, after = -1, -1
             for k in range(size):
                 last = k if row[i, j, k] >= 0 else last

@@ -82,7 +82,14 @@ def voxels_at(
     cells: NDArray[np.intp], shape: tuple[int, ...] = (RESOLUTION,) * 3
 ) -> NDArray[np.uint8]:
     """Return the voxels (N, 3) uint8 at places of the flattened grid; undoes `flat_index`."""
-    return np.stack(np.unravel_index(cells, shape), axis=1, dtype=np.uint8, casting="unsafe")
+    voxels = np.empty((len(cells), 3), dtype=np.uint8)
+    rest = cells.astype(np.uint32)  # Narrow numbers are divided four times as fast.
+    for axis in (2, 1, 0):
+        side = np.uint32(shape[axis])
+        above = rest // side
+        voxels[:, axis] = rest - above * side
+        rest = above
+    return voxels
 
 
 def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
