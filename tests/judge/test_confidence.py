@@ -15,7 +15,7 @@ from slatprep.demo import make_demo
 from slatprep.geometry.deformation import map_of
 from slatprep.inspect.score import Truth, read_truth
 from slatprep.inspect.verify.assets import roundings
-from slatprep.judge import THRESHOLDS, judge, verdict_of, voxel_confidence
+from slatprep.judge import THRESHOLDS, judge, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import causes_of_doubt
 from slatprep.judge.evidence import (
@@ -45,7 +45,6 @@ from slatprep.records import (
     Annotation,
     Judgement,
     MaterialField,
-    Quality,
     StructuredLatents,
     Verdict,
 )
@@ -304,32 +303,3 @@ def test_what_takes_confidence_away_is_named() -> None:
     bent = USUAL.copy()
     bent[FIGURES.index("bending")] = 1.0
     assert next(iter(causes_of_doubt(bent))) == "shape"
-
-
-@pytest.mark.parametrize(
-    ("confidence", "accuracy", "verdict", "word"),
-    [
-        (THRESHOLDS.good_confidence, 1.0, Verdict.GOOD, ""),
-        (0.89, 1.0, Verdict.DOUBTFUL, "89.0%"),
-        (THRESHOLDS.failed_confidence, 1.0, Verdict.DOUBTFUL, "different shapes"),
-        (0.49, 1.0, Verdict.FAILED, "49.0%"),
-        (0.99, 0.7, Verdict.DOUBTFUL, "70.0% of the labels"),
-        (0.99, THRESHOLDS.good_accuracy, Verdict.GOOD, ""),
-    ],
-)
-def test_verdicts_follow_from_confidence(
-    confidence: float, accuracy: float, verdict: Verdict, word: str
-) -> None:
-    # Where the shapes differ a similarity fits badly however right it is.
-    poor = Quality(0.5, 0.5, 0.5, 0.5, 0.5, 1.0)
-    given, reasons = verdict_of(
-        poor,
-        1.0,
-        same_object=confidence,
-        right_placement=1.0,
-        expected_accuracy=accuracy,
-        cause="shape",
-    )
-    assert given is verdict
-    assert word in " ".join(reasons)
-    assert bool(reasons) == (verdict is not Verdict.GOOD)
