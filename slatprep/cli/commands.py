@@ -37,8 +37,8 @@ GROUPS = {
         "transfer": "slatprep.cli.particles:transfer",
         "simulate": "slatprep.cli.particles:simulate",
         "decode-slat": "slatprep.cli.latents:decode_slat",
-        "describe": "slatprep.cli.publish:describe",
-        "publish": "slatprep.cli.publish:publish",
+        "describe": "slatprep.cli.export:describe",
+        "publish": "slatprep.cli.export:publish",
     },
     "Learn": {
         "train": "slatprep.cli.train:train",
