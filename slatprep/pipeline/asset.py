@@ -156,13 +156,11 @@ def _key(asset: Finished, recipe: Recipe) -> str:
 
 def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
     """Return what an interrupted build finished, under the names things have now."""
-    if planned.names is not None:
-        found = spool.find(planned.key)
-        if found is None:
-            return None
+    found = spool.find(planned.key)
+    if found and planned.names:
         spool.amend(planned.names.applied(found[0]))
-    again = spool.find(planned.key)
-    return again and again[1]
+        found = spool.find(planned.key)
+    return found and found[1]
 
 
 def _failure(pair: AssetPair, error: Exception) -> Failed:

@@ -122,7 +122,7 @@ def test_a_settled_store_that_is_built_again_is_found_unchanged(habitual, agreed
 def telling(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BuildParameters]:
     """Make assets whose latents carry material; another object's labels are put on one."""
     root = tmp_path_factory.mktemp("telling")
-    make_demo(root, assets=35, seed=3, levels=(0,), latents="material")
+    make_demo(root, assets=28, seed=3, levels=(0,), latents="material")
     # The classes of one object, metal and stationary alone, become others: its labels are wrong.
     first = sorted((root / "pixieverse").iterdir())[0]
     file = first / "sample_0" / "material_grid.npy"
