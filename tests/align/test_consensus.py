@@ -125,13 +125,6 @@ def test_whichever_placement_came_first_the_same_one_is_chosen():
     assert len(chosen) == 1
 
 
-def test_a_clear_winner_is_left_alone():
-    latents = surface_latents(chair())
-    alignment = align(field_of(chair()), latents, AlignParameters())
-    assert degrees_between(split_transform(alignment.transform)[0], COMMON) > 80
-    assert settle(alignment, latents, _agreeing(6)) is alignment
-
-
 def test_a_planted_rotation_raises_the_share_of_symmetric_assets_placed_right():
     rng = np.random.default_rng(3)
     right = {"before": 0, "after": 0}

@@ -114,6 +114,7 @@ def test_two_classes_in_two_folds_are_enough_for_models_and_less_is_not() -> Non
     here, there = ids_of(0, 1), ids_of(1, 1)
     assert fit_models((name, moments_of(feats, two)) for name in here + there) is not None
     assert fit_models((name, moments_of(feats, two)) for name in ids_of(0, 4)) is None
+    assert fit_models([]) is None
     assert (
         fit_models([(here[0], moments_of(feats, two)), (there[0], moments_of(feats, one))]) is None
     )
