@@ -67,7 +67,8 @@ CLOSE = 0.02
 """Deformed placements tie if they score less than this below the best, as scores tell more then."""
 
 CLEARLY = 2.5
-"""A placement that fits worse by so many standard errors does not tie, however close it scores."""
+"""A placement that fits worse by so many standard errors does not tie, however close it scores;
+one that fits better by any number does, where it was asked."""
 
 
 class Candidates(NamedTuple):
@@ -154,7 +155,7 @@ def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
         placements=tuple(
             Placement(pose.similarity.transform, pose.score, float(pair.apart([pose], best)[0]))
             for pose in others[:MOST_SURVIVORS]
-            if not pose.behind >= CLEARLY and pose.merit > best.merit - tie
+            if pose.behind < 0.0 or (pose.merit > best.merit - tie and not pose.behind >= CLEARLY)
         ),
         score=best.score,
         deformation=deformed.deformation,
