@@ -16,6 +16,7 @@ from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.before import SHARE, Before, look_back
 from slatprep.pipeline.decoys import DECOYS, EVERY, measure_build
+from slatprep.pipeline.notices import counts_of, dataset_notices
 from slatprep.pipeline.pack import Packed, pack_store
 from slatprep.pipeline.plan import (
     Action,
@@ -31,13 +32,7 @@ from slatprep.pipeline.recipe import recipe_of
 from slatprep.pipeline.rows import NextStore, Row
 from slatprep.pipeline.settle import Wanted, check_objects, kept_rows, settle_rows
 from slatprep.pipeline.spool import Spool
-from slatprep.pipeline.summary import (
-    BuildSummary,
-    counts_of,
-    dataset_notices,
-    summarise,
-    summarise_store,
-)
+from slatprep.pipeline.summary import BuildSummary, summarise, summarise_store
 from slatprep.pipeline.work import Work, spool_of, work_beside, work_directory
 from slatprep.readers import discover
 from slatprep.readers.published import fetch_members

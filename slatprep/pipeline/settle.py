@@ -14,11 +14,11 @@ from slatprep.errors import ConfigError, StoreError
 from slatprep.normalize import ranges_from_bounds, ranges_from_extents, to_mapped
 from slatprep.parameters import BuildParameters, NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.before import Before
+from slatprep.pipeline.notices import nothing_usable
 from slatprep.pipeline.plan import BuildContext, Crew, PlannedAsset
 from slatprep.pipeline.recipe import build_of
 from slatprep.pipeline.rows import NextStore, Row, SourceStore, column, in_order, moments_of
 from slatprep.pipeline.spool import Spool
-from slatprep.pipeline.summary import nothing_usable
 from slatprep.readers import contents_of
 from slatprep.readers.contents import resolve_latents
 from slatprep.readers.ranges import pixie_ranges, read_ranges

@@ -1,32 +1,19 @@
-"""What a build did, small enough to print, and what a person should know of its dataset."""
+"""What a build did, small enough to print."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.normalize import PIXIE_RANGES
-from slatprep.parameters import BuildParameters
-from slatprep.pipeline.rows import NextStore, Row, moments_of
-from slatprep.readers.contents import ENOUGH, in_words, look_standardised
-from slatprep.readers.joins import explain_unmatched
-from slatprep.records import AssetPair, Normalization, Place, Status
+from slatprep.records import Normalization, Place, Status
 from slatprep.store import Store
 from slatprep.store.record import FailedRecord
 from slatprep.store.records import SEVERAL, file_names
-
-# What the range would be without an asset: narrower by decades, or by its own widths.
-_WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0
-
-_BESIDE_PIXIE = 0.5
-"""Decades beyond Pixie's published ranges within which PixieVerse itself may reach."""
-
-_NAMED = 3
 
 PROBLEMS_LISTED = 100
 """How many problems a summary lists; the records hold all."""
@@ -106,25 +93,15 @@ class Counts:
     contradicted: tuple[str, ...]
 
 
-def counts_of(assets: Iterable[Row]) -> Counts:
-    """Count what became of finished assets."""
-    usable = list(assets)
-    sizes = np.array([asset.n_voxels for asset in usable], np.int64)
-    return _counts(
-        [asset.asset_id for asset in usable],
-        sizes,
-        lambda name: np.array([asset.columns[name] for asset in usable]),
-    )
-
-
 def counts_in(store: Store) -> Counts:
     """Count what became of the assets of a store."""
-    return _counts(store.ids, np.diff(store.offsets), store.column)
+    return count(store.ids, np.diff(store.offsets), store.column)
 
 
-def _counts(
+def count(
     ids: Sequence[str], sizes: NDArray[np.int64], column: Callable[[str], NDArray[Any]]
 ) -> Counts:
+    """Count what became of assets: their ids, numbers of voxels (N,), and columns by name."""
     contradicted = sorted(ids[row] for row in np.flatnonzero(column("contradicted")).tolist())
     return Counts(
         verdicts=dict(sorted(Counter(map(str, column("verdict"))).items())),
@@ -172,126 +149,3 @@ def summarise_store(
         warnings=tuple(warnings),
         damaged=tuple(damaged),
     )
-
-
-def nothing_usable(
-    failed: Sequence[FailedRecord], parameters: BuildParameters, pairs: Collection[AssetPair] = ()
-) -> str:
-    """Say why there is no store."""
-    if unmatched := explain_unmatched(pairs, parameters):
-        return f"{unmatched}. There is no store"
-    problems = [f"\n  {asset.asset_id}: {asset.reason}" for asset in failed]
-    if not problems:
-        return (
-            f"no asset found in {parameters.pixieverse.root} and {parameters.slat.root}; "
-            "expected files that match the patterns of the dataset definition"
-        )
-    more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
-    return (
-        f"none of {len(problems)} assets can be used, so there is no store:"
-        f"{''.join(problems[:5])}{more}"
-    )
-
-
-def dataset_notices(new: NextStore, standardised: str) -> Iterator[str]:
-    """Yield what a person should know of the assets of a store together."""
-    yield from latent_warnings(new, standardised)
-    yield from unusual_values(new.rows)
-    yield from shared_sources(new)
-    if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
-        ids = [row.asset_id for row in new.rows]
-        yield from wild_ranges(ids, new.column("extent"), new.normalization)
-
-
-def unusual_values(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield once that values of new assets are unusual; their records tell of each."""
-    made = [row for row in rows if row.spooled]
-    told = [(row.asset_id, str(row.columns["unusual"])) for row in made if row.columns["unusual"]]
-    if told:
-        yield (
-            f"values of {len(told)} of {len(made)} assets are unusual "
-            f"({_first([name for name, _ in told])}): {told[0][1]}"
-        )
-
-
-def shared_sources(new: NextStore) -> Iterator[str]:
-    """Yield which objects have one SLAT, and which new ones have one grid, by their content."""
-    slats: defaultdict[object, list[int]] = defaultdict(list)
-    grids: defaultdict[object, list[int]] = defaultdict(list)
-    means, stds = (new.column(name) for name in ("latent_mean", "latent_std"))
-    for at, row in enumerate(new.rows):
-        if not np.isnan(means[at]).any():
-            slats[row.n_voxels, means[at].tobytes(), stds[at].tobytes()].append(at)
-        if row.spooled:
-            grids[row.columns["grid"]].append(at)
-    objects = new.column("object_id")
-    for what, found in (("SLAT", slats), ("grid", grids)):
-        groups = [own for own in found.values() if len({objects[at] for at in own}) > 1]
-        if groups:
-            names = [" = ".join(new.rows[at].asset_id for at in own[:4]) for own in groups]
-            yield (
-                f"{sum(map(len, groups))} assets of different objects have one {what} "
-                f"({_first(names)}): see whether a map or a copy gave it to both"
-            )
-
-
-def wild_ranges(
-    ids: Sequence[str], extents: NDArray[np.float64], normalization: Normalization
-) -> Iterator[str]:
-    """Yield which asset alone makes a range, of mapped extents (A, P, 2), 10 times wider.
-
-    Of two assets nobody can tell which is wild.
-    """
-    if len(ids) < _NAMED:
-        return
-    usual = {one.name: one for one in PIXIE_RANGES.ranges}
-    for column, span in enumerate(normalization.ranges):
-        for end, sign in ((0, -1.0), (1, 1.0)):
-            values = sign * extents[:, column, end]
-            if not np.isfinite(values).all():
-                continue
-            last = int(np.argmax(values))
-            own, others = float(values[last]), np.delete(extents[:, column], last, axis=0)
-            beside = float((sign * others[:, end]).max())
-            width = max(float(others[:, 1].max() - others[:, 0].min()), 1e-12)
-            if own - beside < (_WILD_DECADES if span.log10 else _WILD_WIDTHS * width):
-                continue
-            known = usual.get(span.name)
-            if known and own <= max(sign * known.lo, sign * known.hi) + _BESIDE_PIXIE:
-                continue
-            times = 10.0 ** (own - beside) if span.log10 else 1 + (own - beside) / width
-            ends = [10.0**at if span.log10 else at for at in (sign * own, sign * beside)]
-            yield (
-                f"{ids[last]} alone makes the range of {span.name} {times:.3g} times wider: it has "
-                f"{ends[0]:.3g}, all others end at {ends[1]:.3g}. Look at its source, or give "
-                "normalize.ranges"
-            )
-
-
-def _first(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"{', '.join(names[:_NAMED])}{more}"
-
-
-def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
-    """Yield what a person should know about whether the latents of a store are standardised."""
-    latents = new.contents.latents
-    means, stds = (new.column(name) for name in ("latent_mean", "latent_std"))
-    known = [
-        (row.asset_id, moments)
-        for row, mean, std in zip(new.rows, means, stds, strict=True)
-        if row.n_voxels >= ENOUGH and (moments := moments_of(mean, std))
-    ]
-    looks = {name: look_standardised(moments, latents) for name, moments in known}
-    if latents.standardised and standardised == "auto":
-        yield (
-            f"the latents look standardised already ({in_words(known[0][1])} in {known[0][0]}) and "
-            'are marked so; say slat.standardised = "yes" if they are, "no" if they are not'
-        )
-    others = [name for name, look in looks.items() if look != latents.standardised]
-    if others and standardised != "no":
-        how = "as the encoder gives them" if latents.standardised else "standardised already"
-        yield (
-            f"the latents of {len(others)} of {len(looks)} assets look {how}, unlike the others "
-            f"({', '.join(others[:3])}): look where they come from"
-        )

@@ -10,9 +10,10 @@ from slatprep.errors import ConfigError
 from slatprep.normalize import ranges_from_extents
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.notices import counts_of, nothing_usable, wild_ranges
 from slatprep.pipeline.recipe import recipe_of, record_of_failed
 from slatprep.pipeline.rows import Row
-from slatprep.pipeline.summary import counts_of, nothing_usable, summarise, wild_ranges
+from slatprep.pipeline.summary import summarise
 from slatprep.records import AssetPair, Failed, SourceRoots, Status
 from slatprep.store.record import FailedRecord
 
