@@ -27,7 +27,7 @@ AFFINE = 13  # unknowns: nine of the matrix and three of the shift, row by row, 
 
 _BLOCK = 64  # samples a step at a time: what is kept of them stays in the processor's first cache
 _LANES = 8  # sums of each product, of every eighth sample each: as many on any processor
-_STEP = 32  # samples whose products are added to the sums at once, before these are stored again
+_STEP = 16  # samples whose products are added to the sums at once, before these are stored again
 _FEW = ((0, 0), (0, 3), (0, 6), (3, 3), (3, 6), (6, 6))
 _MANY = (*_FEW, (0, 9), (0, 12), (3, 9), (3, 12), (6, 9), (6, 12), (9, 9), (9, 12), (12, 12))
 # First row and column of each block of three by three products in the upper triangle.
@@ -290,7 +290,7 @@ def _add_products(count, unknowns, block):  # type: ignore[no-untyped-def]
             _add_nine_products(block, first, 12, 12, 14)
 
 
-@kernel(inline="always")
+@kernel(forceinline=True)
 def _add_nine_products(block, first, row, column, number):  # type: ignore[no-untyped-def]
     """Add those of three rows of W A and three of A, `row` and `column` the first of them.
 
