@@ -197,7 +197,7 @@ def test_repetition_and_the_order_of_voxels_do_not_change_a_bit():
         theirs = getattr(two.deformation, name)
         assert getattr(one.deformation, name).tobytes() == theirs.tobytes()
     assert one.deformation.spacing == two.deformation.spacing
-    assert one.figures == two.figures
+    assert repr(one.figures) == repr(two.figures)  # as two NaN are not equal
 
 
 def test_a_finer_lattice_starts_as_the_same_warp():
