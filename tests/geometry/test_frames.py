@@ -181,24 +181,31 @@ def test_places_in_the_flattened_grid_are_those_of_numpy(seed, side):
 
 
 def test_what_is_above_the_ground_by_hand():
-    """A hollow box from z = 10 to 19, on ground whose top is the upper face of layer 12."""
+    """A hollow box from z = 10 to 19, on ground whose top is the upper face of layer 12.
+
+    Of the ground only what is under the box stays, a layer whose centres are half a voxel down.
+    """
     hollow = np.zeros((64, 64, 64), dtype=bool)
+    hollow[:, :, 9:13] = True
     hollow[20:30, 25:35, 10:20] = True
     hollow[21:29, 26:34, 11:19] = False
     top = 13 / 64 - 0.5
     left = above(hollow, Ground(np.array([0.0, 0.0, 1.0]), top))
     expected = np.zeros((64, 64, 64), dtype=bool)
-    expected[20:30, 25:35, 13:20] = True
+    expected[20:30, 25:35, 12:20] = True
     np.testing.assert_array_equal(left, expected)
     assert above(hollow, None) is hollow
-    # A centre that lies in the ground's top is not above it.
+    # Of two layers the centres lie in the top and a voxel under it; those of the next are two down.
     at_centre = above(hollow, Ground(np.array([0.0, 0.0, 1.0]), 13.5 / 64 - 0.5))
-    assert not at_centre[:, :, 13].any() and at_centre[20:30, 25:35, 14].all()
+    np.testing.assert_array_equal(at_centre, expected)
 
 
 def test_ground_may_slope_along_any_axis():
     full = np.ones((64, 64, 64), dtype=bool)
     normal = np.array([0.48, -0.6, 0.64])
     centres = (np.argwhere(full) + 0.5) / 64 - 0.5
-    left = above(full, Ground(normal, 0.1))
-    np.testing.assert_array_equal(left.reshape(-1), centres @ normal > 0.1)
+    left, heights = above(full, Ground(normal, 0.1)).reshape(-1), centres @ normal - 0.1
+    assert left[heights > 0].all()
+    assert not left[heights < -1.501 / 64].any()
+    # What would stand on them is outside the grid for some at its faces.
+    assert left[(heights > -1.499 / 64) & (abs(centres).max(axis=1) < 0.45)].all()
