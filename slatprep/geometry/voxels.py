@@ -64,7 +64,8 @@ def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.boo
     depths = (ground.height - (x[:, None, None] + y[:, None] + z)) / VOXEL_SIZE
     higher: NDArray[np.bool_] = filled(occupancy) & (depths < 0.0)
     below = np.argwhere((depths >= 0.0) & (depths < FOOT))
-    steps = depths[tuple(below.T)] + 0.75
+    # To round a place moves it by sqrt(3) / 2 at most.
+    steps = depths[tuple(below.T)] + 0.9
     over = np.rint(below + steps[:, None] * ground.normal).astype(np.intp)
     inside = ((over >= 0) & (over < RESOLUTION)).all(axis=1)
     stands = higher[tuple(over[inside].T)]
