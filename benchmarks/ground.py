@@ -17,8 +17,8 @@ Its top lies up to 1.5 voxels above the object's foot; its class is any, in a qu
 the cases one of the object's. Printed for objects that are not symmetric, by the engine as
 it is and by one that does not look for ground: the share that is placed right (within
 1.5 voxels of the best similarity), median displacement, mean share of right labels beside that of
-the true places, and the verdicts of right and of wrong placements; and those of SLATs of
-other objects, on the slab `full`.
+the true places, and the verdicts of right and of wrong placements; those of SLATs of
+other objects, on the slab `full`; and the wrong ones that are good, with their labels.
 """
 
 from __future__ import annotations
@@ -278,7 +278,10 @@ def _print(rows: Iterable[Row]) -> None:
             f"| {np.mean([s.truth_own for s in scores]):.3f} "
             f"| {_verdicts(right)} | {_verdicts(wrong)} |"
         )
-    print(f"other objects: {_verdicts([row for row in rows if row.other])}", flush=True)
+    print(f"other objects: {_verdicts([row for row in rows if row.other])}")
+    sure = [(r.score, r) for r in rows if r.score and not r.score.symmetric and r.verdict == "good"]
+    wrong = [f"{s.name} {s.label_accuracy:.2f}" for s, _ in sure if not s.placed]
+    print(f"wrong and good, with their labels: {', '.join(wrong)}", flush=True)
 
 
 def _verdicts(rows: Iterable[Row]) -> str:

@@ -12,8 +12,8 @@ that the choice can be undone.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,23 +45,22 @@ NEAR_DEGREES = 30.0
 """Rotations this near to a quarter turn count as that quarter turn."""
 
 
-def find_consensus(transforms: Iterable[ArrayLike]) -> Consensus | None:
-    """Find the rotation that clear winners have in common, from their transforms (4, 4).
+def find_consensus(transforms: ArrayLike) -> Consensus | None:
+    """Find the rotation that clear winners have in common, from their transforms (A, 4, 4).
 
     It is the mean of the rotations near the most frequent quarter turn. None where fewer than
     `LEAST_WINNERS` assets or less than `LEAST_SHARE` of them agree.
     """
-    rotations = [split_transform(transform)[0] for transform in transforms]
-    near: dict[int, list[NDArray[np.float64]]] = {}
-    for rotation in rotations:
-        angles = [degrees_between(rotation, start.rotation) for start in distinct_starts()]
-        nearest = int(np.argmin(angles))
-        if angles[nearest] <= NEAR_DEGREES:
-            near.setdefault(nearest, []).append(rotation)
-    if not near:
+    linear = np.asarray(transforms, np.float64).reshape(-1, 4, 4)[:, :3, :3]
+    rotations = linear / np.cbrt(np.linalg.det(linear))[:, None, None]
+    if not len(rotations):
         return None
+    quarters = [start.rotation for start in distinct_starts()]
+    angles = np.stack([degrees_between(rotations, quarter) for quarter in quarters], axis=1)
+    nearest = np.where(angles.min(axis=1) <= NEAR_DEGREES, angles.argmin(axis=1), len(quarters))
     # The lowest index wins a draw, so that the order of assets does not matter.
-    _, members = max(near.items(), key=lambda item: (len(item[1]), -item[0]))
+    common = np.bincount(nearest, minlength=len(quarters))[: len(quarters)].argmax()
+    members = rotations[nearest == common]
     if len(members) < LEAST_WINNERS or len(members) < LEAST_SHARE * len(rotations):
         return None
     return Consensus(
@@ -123,7 +122,7 @@ def turn_if_likelier(
 
 def is_common(transform: ArrayLike, consensus: Consensus) -> bool:
     """Whether a transform (4, 4) turns as the dataset does."""
-    return degrees_between(split_transform(transform)[0], consensus.rotation) <= NEAR_DEGREES
+    return bool(degrees_between(split_transform(transform)[0], consensus.rotation) <= NEAR_DEGREES)
 
 
 def probability_of_common(consensus: Consensus, gain: float) -> float:
@@ -142,13 +141,13 @@ def _shares_of(consensus: Consensus) -> tuple[float, float]:
     return common, (1.0 - common) / (len(distinct_starts()) - 1)
 
 
-def degrees_between(rotation: ArrayLike, other: ArrayLike) -> float:
-    """Return the angle, in degrees, of the rotation from one (3, 3) to the other."""
-    trace = float(np.sum(np.asarray(rotation) * np.asarray(other)))
-    return float(np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))))
+def degrees_between(rotation: ArrayLike, other: ArrayLike) -> Any:
+    """Return the angle, in degrees, of the turn from one rotation (3, 3) or several to another."""
+    trace = np.sum(np.asarray(rotation) * np.asarray(other), axis=(-2, -1))
+    return np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
-def _mean_rotation(rotations: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Chordal mean: the rotation nearest to the mean matrix."""
     # Summed in sorted order: the mean must not depend on the order of assets.
     ordered = sorted(rotations, key=lambda rotation: rotation.tobytes())

@@ -325,7 +325,7 @@ def _publish(
             "they did; all sources were hashed"
         )
     if following is not None and packed is not None:
-        warnings += dataset_notices(following, parameters.slat.standardised)
+        warnings += dataset_notices(following, parameters)
     seconds = time.perf_counter() - begin
     summary = summarise_store(store, failed, place.out, manifests, seconds, warnings, damaged)
     summary = replace(summary, rehash_seed=before.seed)

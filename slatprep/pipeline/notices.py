@@ -8,13 +8,15 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.align.consensus import find_consensus
+from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import NextStore, Row, moments_of
 from slatprep.pipeline.summary import Counts, count
 from slatprep.readers.contents import ENOUGH, in_words, look_standardised
 from slatprep.readers.joins import explain_unmatched
-from slatprep.records import AssetPair, Normalization
+from slatprep.records import AssetPair, Normalization, Verdict
 from slatprep.store.record import FailedRecord
 
 # What the range would be without an asset: narrower by decades, or by its own widths.
@@ -56,9 +58,11 @@ def nothing_usable(
     )
 
 
-def dataset_notices(new: NextStore, standardised: str) -> Iterator[str]:
+def dataset_notices(new: NextStore, parameters: BuildParameters) -> Iterator[str]:
     """Yield what a person should know of the assets of a store together."""
-    yield from latent_warnings(new, standardised)
+    yield from latent_warnings(new, parameters.slat.standardised)
+    if not (parameters.consensus.settle or parameters.pixieverse.samples == "merge"):
+        yield from shared_rotation(new)
     yield from unusual_values(new.rows)
     yield from shared_sources(new)
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
@@ -74,6 +78,20 @@ def unusual_values(rows: Sequence[Row]) -> Iterator[str]:
         yield (
             f"values of {len(told)} of {len(made)} assets are unusual "
             f"({_first([name for name, _ in told])}): {told[0][1]}"
+        )
+
+
+def shared_rotation(new: NextStore) -> Iterator[str]:
+    """Yield that a consensus may settle ties of new assets, where most others are turned alike."""
+    tied = new.column("ambiguity") > THRESHOLDS.good_ambiguity
+    if not any(row.spooled for row, ties in zip(new.rows, tied, strict=True) if ties):
+        return
+    sure = ~tied & (new.column("verdict") != Verdict.FAILED)
+    if common := find_consensus(new.column("transform")[sure]):
+        yield (
+            f"{tied.sum():,} of {len(tied):,} assets have other placements that fit about as well, "
+            f"and {common.agreeing:,} of {common.winners:,} others share a rotation: --consensus "
+            "takes that where it is likelier"
         )
 
 

@@ -98,7 +98,7 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
     tied = [asset for asset in assets if asset.columns["n_placements"]]
     others = [asset for asset in assets if not asset.columns["n_placements"]]
     consensus = find_consensus(
-        asset.columns["transform"] for asset in others if asset.columns["verdict"] != Verdict.FAILED
+        [one.columns["transform"] for one in others if one.columns["verdict"] != Verdict.FAILED]
     )
     if consensus is None:
         crew.tell(f"consensus: too few assets share a rotation; {len(tied):,} tied ones stay")

@@ -103,12 +103,17 @@ def test_building_without_it_brings_the_first_placements_back(habitual, agreed, 
     _, parameters = habitual
     with_it = replace(parameters, consensus=SETTLED)
     store = tmp_path / "store.zarr"
-    build_store(with_it, store, jobs=2)
+    settled = build_store(with_it, store, jobs=2)
     assert tree(store) == tree(agreed[1])  # whatever the jobs, and what was there
     plan = plan_build(parameters, store)
     assert {asset.action for asset in plan.assets} == {"reuse"}  # no asset is aligned again
-    build_store(parameters, store)
+    unsettled = build_store(parameters, store)
     assert tree(store) == tree(agreed[0])
+    assert not any("--consensus" in text for text in settled.warnings)
+    (advice,) = (text for text in unsettled.warnings if "--consensus" in text)
+    sure = open_store(store).column("ambiguity") <= THRESHOLDS.good_ambiguity
+    assert advice.startswith(f"{(~sure).sum()} of {len(sure)} assets have other placements")
+    assert "others share a rotation" in advice
 
 
 def test_a_settled_store_that_is_built_again_is_found_unchanged(habitual, agreed):
