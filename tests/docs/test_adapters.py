@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from support.installed import package
 from support.synthetic import make_asset
 
 from slatprep import build_store, load_parameters, open_store
@@ -24,19 +25,10 @@ def blocks(language: str) -> list[str]:
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Install the page's adapter: a module, and what a package's metadata say."""
-    site = tmp_path / "site"
-    about = site / "mine-1.0.dist-info"
-    about.mkdir(parents=True)
-    (site / "mine.py").write_text(blocks("python")[0])
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
     name, value = re.findall(r'^(\w+) = "(mine:\w+)"$', "\n".join(blocks("toml")), re.M)[0]
-    (about / "entry_points.txt").write_text(f"[slatprep.sources]\n{name} = {value}\n")
-    monkeypatch.syspath_prepend(str(site))
-    adapters._known.cache_clear()
-    adapters._loaded.cache_clear()
-    yield
-    adapters._known.cache_clear()
-    adapters._loaded.cache_clear()
+    modules, points = {"mine": blocks("python")[0]}, f"[slatprep.sources]\n{name} = {value}\n"
+    with package(tmp_path / "site", "mine", modules, points, monkeypatch):
+        yield
 
 
 @pytest.mark.usefixtures("installed")

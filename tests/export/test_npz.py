@@ -9,13 +9,12 @@ import pandas
 import pytest
 from support.commands import refused, run
 from support.exports import hold_truth, index_of
+from support.raw_sources import field_at
 from support.synthetic import JELLY, METAL
 
 from slatprep.errors import ConfigError
 from slatprep.export import ExportOptions, export_store
-from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.readers import discover, read_field
-from slatprep.records import MATERIAL_CLASSES, MaterialField
+from slatprep.records import MATERIAL_CLASSES
 
 ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"  # latent_model of TRELLIS's configurations
 
@@ -124,16 +123,6 @@ def load_materials(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return where, np.stack(what, axis=1)
 
 
-def field_at(root: Path, name: str) -> MaterialField:
-    """Read a field as the adapter for VoMP's data does; a SLAT is made for it."""
-    slat = root.parent / "slat"
-    slat.mkdir()
-    np.savez(slat / f"{name}.npz", coords=np.zeros((1, 3), np.uint8), feats=np.ones((1, 8)))
-    source = PixieverseSource(root, adapter="vomp")
-    (pair,) = discover(BuildParameters(source, SlatSource(slat)))
-    return read_field(pair)
-
-
 def test_the_loader_of_vomp_finds_every_voxel_and_its_material(store, mixed, tmp_path):
     from scipy.spatial import cKDTree
 
@@ -159,7 +148,7 @@ def test_the_loader_of_vomp_finds_every_voxel_and_its_material(store, mixed, tmp
 def test_the_solid_is_read_back_by_the_adapter_for_vomp_s_data(store, mixed, tmp_path):
     words = (store, "--format", "voxel_data", "--points", "grid", "--asset", "cup")
     run("export", *words, "--out", tmp_path / "vomp")
-    field = field_at(tmp_path / "vomp", "cup")
+    field = field_at(tmp_path / "vomp", "vomp", "cup")
     grid = mixed.assets["cup"].grid
     solid = np.argwhere(grid[..., 3] != 7)
     # The frames differ by a quarter turn: (x, y, z) becomes (-y, x, z).

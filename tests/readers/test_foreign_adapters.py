@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.installed import package
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
-from slatprep.readers import adapters, read_latents
+from slatprep.readers import read_latents
 from slatprep.readers.adapters import FoundField, Holding, source_adapter
 from slatprep.readers.contents import latent_space
 from slatprep.readers.foreign import guarded
@@ -166,27 +167,17 @@ def test_what_is_no_field_is_not_found(found):
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    for name, code in (
-        ("torn", "def ("),
-        ("boom", "raise RuntimeError('at import')"),
-        ("leave", "import sys; sys.exit(3)"),
-        ("borrowed", "from slatprep.readers.slat import trellis as made"),
-    ):
-        (tmp_path / f"adapter_{name}.py").write_text(code)
-    about = tmp_path / "theirs-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
-    names = ("torn", "boom", "leave", "borrowed", "gone")
-    lines = "".join(f"{name} = adapter_{name}:made\n" for name in names)
-    (about / "entry_points.txt").write_text(
-        f"[slatprep.sources]\n{lines}[slatprep.latents]\n{lines}"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    for cached in (adapters._known, adapters._loaded):
-        cached.cache_clear()
-    yield
-    for cached in (adapters._known, adapters._loaded):
-        cached.cache_clear()
+    codes = {
+        "torn": "def (",
+        "boom": "raise RuntimeError('at import')",
+        "leave": "import sys; sys.exit(3)",
+        "borrowed": "from slatprep.readers.slat import trellis as made",
+    }
+    modules = {f"adapter_{name}": code for name, code in codes.items()}
+    lines = "".join(f"{name} = adapter_{name}:made\n" for name in (*codes, "gone"))
+    points = f"[slatprep.sources]\n{lines}[slatprep.latents]\n{lines}"
+    with package(tmp_path, "theirs", modules, points, monkeypatch):
+        yield
 
 
 @pytest.mark.usefixtures("installed")

@@ -18,11 +18,12 @@ from slatprep.records import AssetPair
 
 SETTINGS = settings(max_examples=150, derandomize=True, database=None)
 
-# Where, how many bytes are replaced, and by what: a flip, a cut, an insertion, all of them.
+# Where, how many bytes are replaced, and by what: a flip, a cut, an insertion, all of them; or
+# all that follows is cut off.
 EDITS = st.lists(
     st.tuples(
         st.floats(0, 1),
-        st.integers(0, 40),
+        st.one_of(st.integers(0, 40), st.just(10**9)),
         st.one_of(
             st.binary(max_size=12),
             st.sampled_from([b"\0", b"\xff", b"\xff" * 8, b"\0" * 8, b"\xff\xff\xff\x7f"]),

@@ -143,17 +143,6 @@ def test_files_that_are_no_lists_are_named(tmp_path, name, ids, message):
     assert str(path) in str(caught.value)
 
 
-def test_no_pickle_is_read(tmp_path):
-    class Bomb:
-        def __reduce__(self) -> tuple[Any, ...]:
-            return (Path.touch, (tmp_path / "harmed",))
-
-    np.save(tmp_path / "a.npy", np.array([Bomb()], object), allow_pickle=True)
-    with pytest.raises(InputError, match="pickle"):
-        read_lists(tmp_path / "a.npy")
-    assert not (tmp_path / "harmed").exists()
-
-
 def test_a_file_without_an_end_is_not_read_to_it(tmp_path):
     path = tmp_path / "large.txt"
     with path.open("wb") as file:

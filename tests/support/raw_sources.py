@@ -49,11 +49,12 @@ def npy(array: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def field_at(root: Path, adapter: str = "voxels", **units: str) -> MaterialField:
+def field_at(root: Path, adapter: str = "voxels", name: str = "a", **units: str) -> MaterialField:
     """Read the one field below a root, for which a SLAT is made."""
     slat = root.parent / "slat"
     slat.mkdir(exist_ok=True)
-    np.savez(slat / "a.npz", coords=np.zeros((1, 3), np.uint8), feats=np.ones((1, 8), np.float32))
+    latents = np.zeros((1, 3), np.uint8), np.ones((1, 8), np.float32)
+    np.savez(slat / f"{name}.npz", coords=latents[0], feats=latents[1])
     source = PixieverseSource(root, adapter=adapter, units=Units(**units))
     (pair,) = discover(BuildParameters(source, SlatSource(slat)))
     return read_field(pair)

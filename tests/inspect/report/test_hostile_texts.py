@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -21,9 +20,6 @@ from slatprep.parameters import (
 )
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
-
-if TYPE_CHECKING:
-    pass
 
 pytest.importorskip("selenium")
 

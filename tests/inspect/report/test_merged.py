@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,9 +13,6 @@ from support.synthetic import MakeDataset
 from slatprep.inspect.report import write_report
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
-
-if TYPE_CHECKING:
-    pass
 
 FACTORS = {"a": (1.0, 2.0), "b": (1.0, 1.1, 1.0)}
 """What the samples of the objects make of Young's modulus."""
