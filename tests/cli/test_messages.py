@@ -255,15 +255,17 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monke
 # -- disks ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["report", "describe"])
-def test_a_full_disk_is_a_line(store, tmp_path, monkeypatch, command):
+@pytest.mark.parametrize(
+    "words", ["report --out", "describe --out", "check-alignment --asset ant --picture"]
+)
+def test_a_full_disk_is_a_line(store, tmp_path, monkeypatch, words):
     def full(path: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(atomic, "flush", full)
-    line = refused(command, store, "--out", tmp_path / "result", code=1)
+    line = refused(*words.split(), tmp_path / "result.png", store, code=1)
     assert "cannot be written to" in line
-    assert "No space left on device" in line and "Make room" in line
+    assert "No space left on device" in line and "ake room" in line
     assert list(tmp_path.iterdir()) == []
 
 

@@ -221,17 +221,6 @@ def test_hdf5_groups_by_view_in_several_files(find, tmp_path):
     np.testing.assert_array_equal(read_latents(found["b"]).feats, FEATS)
 
 
-def test_patterns_of_deeper_layouts(find):
-    (pair,) = find(
-        ["set/a/a_grid.npy"],
-        ["latents/model/a.npz"],
-        pixieverse={"grid": ("set/{id}/{id}_grid.npy",)},
-        slat={"pattern": ("latents/*/{id}.npz",)},
-    )
-    assert pair.problem == ""
-    assert pair.slat.parts[-3:] == ("latents", "model", "a.npz")
-
-
 @pytest.mark.parametrize(
     "pattern", ["/{id}.npz", "../{id}.npz", "a//{id}.npz", "{name}.npz", "{id}_{id}.npz"]
 )

@@ -1,8 +1,6 @@
 """`slatprep check-alignment` draws what the store holds, of the assets that were meant."""
 
 import json
-import resource
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -105,24 +103,6 @@ def test_the_picture_is_whole_and_the_same_each_time(copy, tmp_path):
     for top in (142, 456, 770):
         for left in (48, 362, 676, 990, 1350):
             assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
-
-
-@pytest.mark.usefixtures("sides")
-def test_on_a_full_disk_the_picture_that_is_there_stays(copy, tmp_path):
-    """A limit on the size of files refuses writes midway, as a full disk does."""
-    picture = tmp_path / "pictures" / "ant.png"
-    picture.parent.mkdir()
-    picture.write_bytes(b"a good one")
-    most = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, most[1]))
-    try:
-        told = run("--asset", "ant", "--store", copy, "--picture", picture, code=1).stderr
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, most)
-        signal.signal(signal.SIGXFSZ, before)
-    assert f"the picture: cannot be written to {picture} (File too large)" in told
-    assert [file.read_bytes() for file in picture.parent.iterdir()] == [b"a good one"]
 
 
 @pytest.mark.usefixtures("sides")
