@@ -152,7 +152,7 @@ def _judge(field_of: Pair, latents_of: Pair) -> tuple[bool, float, float, str]:
     gaps = np.linalg.norm(places_of(latents.centres, best) - latents_of.places, axis=1) / VOXEL_SIZE
     turn = degrees_between(split_transform(found.transform)[0], split_transform(best)[0])
     labels = float((annotation.material == latents_of.material)[annotation.valid].mean())
-    return turn < WRONG_HEADING, float(np.percentile(gaps, 95)), labels, str(verdict)
+    return bool(turn < WRONG_HEADING), float(np.percentile(gaps, 95)), labels, str(verdict)
 
 
 def _verdicts(rows: Iterable[tuple[bool, float, float, str]]) -> str:
