@@ -117,7 +117,6 @@ def export_store(
     writer: Writer = resolve_name(FORMATS[format])(opened, ids, options)
     about = _about(opened, format)
     entries: list[_Entry] = []
-    notes = writer.notes
     if writer.is_export is not None:
         with target.file(out, writer.is_export) as file:
             for written in writer.write(file, about, map(opened.asset, ids)):
@@ -134,8 +133,7 @@ def export_store(
                 entries += part
                 tell(len(entries), len(ids))
             entries.sort(key=lambda entry: str(entry["asset_id"]))
-            notes = writer.notes + (writer.remarks(entries) if writer.remarks else ())
-            about |= {"notes": notes}
+            about |= {"notes": writer.remarks(entries)}
             if writer.finish is not None:
                 about |= {"files": writer.finish(directory, entries)}
             target.write_index(directory, about, entries)
@@ -148,7 +146,7 @@ def export_store(
         files=len(sizes),
         size=sum(sizes),
         seconds=time.perf_counter() - begin,
-        notes=notes,
+        notes=writer.remarks(entries),
     )
 
 

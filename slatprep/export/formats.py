@@ -163,13 +163,11 @@ class Writer:
         of the store, and all assets.
     batch : int
         Assets per task of a worker; several, because each task opens the store.
-    notes : tuple of str
-        Remarks on the result for the user.
     finish : callable, optional
         Takes the folder and the index's entries, sorted by id; writes the files that cover all
         assets and returns their names.
-    remarks : callable, optional
-        Takes the index's entries; returns further remarks for the user.
+    remarks : callable
+        Takes the index's entries; returns remarks on the result for the user.
     is_export : callable, optional
         Only for an export in a single file, which one process writes: whether an existing
         file is such an export, so that it may be replaced.
@@ -177,7 +175,6 @@ class Writer:
 
     write: Callable[..., Iterable[Exported]]
     batch: int = 16
-    notes: tuple[str, ...] = ()
     finish: Callable[[Path, Sequence[dict[str, Any]]], Sequence[str]] | None = None
-    remarks: Callable[[Sequence[dict[str, Any]]], tuple[str, ...]] | None = None
+    remarks: Callable[[Sequence[dict[str, Any]]], tuple[str, ...]] = lambda _entries: ()
     is_export: Callable[[Path], bool] | None = None

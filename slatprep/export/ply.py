@@ -70,7 +70,7 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
         bounds=bounds,
         max_distance=store.about.build.parameters.sample.max_distance,
     )
-    return Writer(one, notes=notes)
+    return Writer(one, remarks=lambda _entries: notes)
 
 
 def write(

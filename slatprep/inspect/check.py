@@ -35,7 +35,7 @@ voxels.
 
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
-_LIMITS = {
+LIMITS = {
     "confidence": (">=", operator.ge, THRESHOLDS.good_confidence),
     "expected_accuracy": (">=", operator.ge, THRESHOLDS.good_accuracy),
     "valid_share": (">=", operator.ge, THRESHOLDS.good_valid_share),
@@ -61,9 +61,9 @@ class Figure:
     @property
     def passes(self) -> bool | None:
         """Whether the value is that of a good alignment; None if it has no threshold."""
-        if self.settled or self.name not in _LIMITS:
+        if self.settled or self.name not in LIMITS:
             return None
-        _, compare, limit = _LIMITS[self.name]
+        _, compare, limit = LIMITS[self.name]
         return bool(compare(self.value, limit))
 
     @property
@@ -71,7 +71,7 @@ class Figure:
         """The threshold in words, like ``>= 0.8``; empty if there is none."""
         if self.passes is None:
             return ""
-        sign, _, limit = _LIMITS[self.name]
+        sign, _, limit = LIMITS[self.name]
         return f"{sign} {limit:g}"
 
     @property

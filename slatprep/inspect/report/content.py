@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align.starts import distinct_starts
 from slatprep.geometry.frames import split_transform
+from slatprep.inspect.check import LIMITS
 from slatprep.inspect.pictures.canvas import DISTANCE_COLOURS
 from slatprep.inspect.report.drawn import BINS, COLUMNS, LEVELS, PER_SHEET, VIEWS
 from slatprep.inspect.report.outcomes import DIGITS, Outcomes, kinds_of, rounded
@@ -71,12 +72,7 @@ def page_content(
         ],
         "voxels": int(store.offsets[-1]),
         "engine": sorted(set(map(str, store.column("engine")))),
-        "thresholds": {
-            "confidence": THRESHOLDS.good_confidence,
-            "expected_accuracy": THRESHOLDS.good_accuracy,
-            "valid_share": THRESHOLDS.good_valid_share,
-            "ambiguity": THRESHOLDS.good_ambiguity,
-        },
+        "thresholds": {name: limit for name, (_, _, limit) in LIMITS.items()},
         "classes": [
             {"name": name, "colour": MATERIAL_COLOURS[index]}
             # Unused numbers have an empty name.
