@@ -1,16 +1,15 @@
 """Whatever a stranger's store, records or truth hold, no command ends in a traceback."""
 
 import csv
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import zarr
 from click.testing import Result
 from support.commands import document, refused, run
+from support.made_store import edit_json, rewrite
 
 from slatprep.store import open_store
 
@@ -34,12 +33,6 @@ def every_command(store: Path) -> dict[str, Result]:
         },
     }
     return {name: run(*line, code=None) for name, line in lines.items()}
-
-
-def edit(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    document = json.loads(file.read_text())
-    change(document)
-    file.write_text(json.dumps(document))
 
 
 def _set(*path: str, value: object) -> Callable[[dict[str, Any]], object]:
@@ -82,7 +75,7 @@ ATTRIBUTES: dict[str, Callable[[dict[str, Any]], object]] = {
 
 @pytest.mark.parametrize("case", ATTRIBUTES)
 def test_attributes(store, case):
-    edit(store / "zarr.json", lambda document: ATTRIBUTES[case](document["attributes"]))
+    edit_json(store / "zarr.json", lambda document: ATTRIBUTES[case](document["attributes"]))
     for name, done in every_command(store).items():
         assert done.exit_code == 1, name
         assert "slatprep: error" in done.stderr or name == "verify"
@@ -97,7 +90,7 @@ def test_attributes_that_are_not_known_hinder_nobody(store):
         attributes["build"]["parameters"]["sample"]["of_tomorrow"] = 5
         attributes["build"]["parameters"]["align"]["engine"] = "of tomorrow"
 
-    edit(store / "zarr.json", change)
+    edit_json(store / "zarr.json", change)
     for name, done in every_command(store).items():
         assert done.exit_code == (name == "verify"), done.output
 
@@ -132,17 +125,13 @@ def test_records_beside_a_store(store, case):
         file.unlink()
         file.symlink_to(content)
     elif callable(content):
-        edit(file, content)
+        edit_json(file, content)
     else:
         file.write_bytes(content)
     for command in READERS[name]:
         out = ("--out", store.with_suffix(".html")) if command == "report" else ()
         told = run(command, store, *out, code=1).output
         assert name in told and (not isinstance(content, Path) or "no regular file" in told)
-
-
-def rewrite(store: Path, array: str, row: int, value: object) -> None:
-    zarr.open_group(store, mode="r+", use_consolidated=False)[array][row] = value
 
 
 def test_escape_sequences_do_not_reach_the_terminal(store):

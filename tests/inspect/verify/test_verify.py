@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zarr
 from support.commands import document, refused, run
+from support.faults import flip
+from support.made_store import edit_json, rewrite
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import Finding, SourceRoots, verify_store
@@ -28,17 +29,6 @@ def found(store: Path, **options: object) -> tuple[Finding, ...]:
 
 def of_file(findings: tuple[Finding, ...], file: str) -> list[Finding]:
     return [finding for finding in findings if finding.file == file]
-
-
-def change(store: Path, name: str, edit: Callable[[bytearray], object]) -> None:
-    data = bytearray((store / name).read_bytes())
-    edit(data)
-    (store / name).write_bytes(data)
-
-
-def rewrite(store: Path, array: str, rows: object, values: object) -> None:
-    """Change values the proper way, by zarr: checksums are right, digests are not."""
-    zarr.open_group(store, mode="r+", use_consolidated=False)[array][rows] = values
 
 
 def test_a_sound_store_has_no_findings(mixed_build):
@@ -74,10 +64,6 @@ SHARDS = [
 ]
 
 
-def flip(data: bytearray, byte: int, bit: int) -> None:
-    data[byte] ^= bit
-
-
 @pytest.mark.parametrize(
     ("name", "byte", "what"),
     [
@@ -86,7 +72,7 @@ def flip(data: bytearray, byte: int, bit: int) -> None:
     ],
 )
 def test_a_flipped_bit_names_the_file_and_the_assets(store, name, byte, what):
-    change(store, name, lambda data: flip(data, byte, 8))
+    flip(store / name, byte, 3)
     findings = of_file(found(store), name)
     assert any("its bytes changed" in finding.what for finding in findings)
     assert any(finding.asset and what in finding.what for finding in findings)
@@ -95,7 +81,7 @@ def test_a_flipped_bit_names_the_file_and_the_assets(store, name, byte, what):
 def test_truncated_shards_are_found(store):
     sizes = {name: (store / name).stat().st_size for name in SHARDS}
     for name in SHARDS:
-        change(store, name, lambda data: data.__delitem__(slice(-7, None)))
+        os.truncate(store / name, sizes[name] - 7)
     all_found = found(store)
     for name, size in sizes.items():
         said = [finding.what for finding in of_file(all_found, name)]
@@ -243,12 +229,6 @@ def test_a_coordinate_beyond_the_grid_is_refused_wherever_an_asset_is_read(store
         assert "a coordinate above 63" in refused(*words, code=1)
 
 
-def edit_json(path: Path, edit: Callable[[dict], object]) -> None:
-    document = json.loads(path.read_text())
-    edit(document)
-    path.write_text(json.dumps(document))
-
-
 @pytest.mark.parametrize(
     ("edit", "what"),
     [
@@ -380,7 +360,7 @@ def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
     assert result.ok
     assert result.sources == 10
     grid, slat = roots.pixieverse / "ant/sample_0/material_grid.npy", roots.slat / "cup.npz"
-    change(grid.parent, grid.name, lambda data: flip(data, 1000, 1))
+    flip(grid, 1000)
     slat.unlink()
     findings = found(store, sources=True, roots=roots)
     assert [(f.file, f.asset, f.what) for f in findings] == [
@@ -396,7 +376,7 @@ def test_a_second_look_remembers_nothing_of_the_first(store, mixed, tmp_path):
     assert verify_store(store, roots=roots, sources=True).ok
     slat = roots.slat / "ant.npz"
     times = slat.stat().st_atime_ns, slat.stat().st_mtime_ns
-    change(roots.slat, "ant.npz", lambda data: flip(data, 300, 1))
+    flip(slat, 300)
     os.utime(slat, ns=times)
     rewrite(store, "asset/id", 4, "zebra")
     findings = found(store, roots=roots, sources=True)
