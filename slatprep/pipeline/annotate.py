@@ -15,8 +15,7 @@ from slatprep.errors import InputError
 from slatprep.geometry.deformation import map_of
 from slatprep.judge import judge, merged, voxel_confidence
 from slatprep.parameters import BuildParameters, SampleParameters
-from slatprep.readers import read_field, read_latents
-from slatprep.readers.identity import hash_sources, source_digests
+from slatprep.readers import hash_sources, read_field, read_latents, source_digests
 from slatprep.records import (
     Alignment,
     Annotation,

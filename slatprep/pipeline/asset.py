@@ -40,8 +40,7 @@ from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
 from slatprep.pipeline.recipe import Recipe, record_of, record_of_failed
 from slatprep.pipeline.rows import Row, SourceStore
 from slatprep.pipeline.spool import Spool
-from slatprep.readers import read_field, read_latents
-from slatprep.readers.identity import reading_of, source_digests
+from slatprep.readers import read_field, read_latents, reading_of, source_digests
 from slatprep.records import (
     RESOLUTION,
     AssetPair,

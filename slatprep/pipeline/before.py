@@ -30,7 +30,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import NextStore, SourceStore, checked_store, store_there
-from slatprep.readers.identity import hash_sources
+from slatprep.readers import hash_sources
 from slatprep.readers.slat import texture_of
 from slatprep.records import AssetPair, Contents, Place
 from slatprep.storage.files import open_regular, private_file
@@ -332,20 +332,18 @@ def _state_of(pair: AssetPair, state_of: Callable[[Place], Noted]) -> bytes:
     states: list[object] = [boot_id(), names]
     files = _files(pair)
     for file in files:
-        state = None if file is None else state_of(file)
-        if file is not None and state is None:
+        state = state_of(file)
+        if state is None:
             return _UNKNOWN
         states.append((str(file), state))
     return hashlib.blake2b(repr(states).encode(), digest_size=16).digest() if files else _UNKNOWN
 
 
-def _files(pair: AssetPair) -> list[Place | None]:
+def _files(pair: AssetPair) -> list[Place]:
     """Return the files of an asset, in an order; none where they cannot be told."""
     try:
         texture = pair.slat and texture_of(pair.slat, pair.roots.contents.latents)
     except InputError:
         return []
-    files = [pair.slat, texture]
-    for one in pair.annotations:
-        files += [one.grid, one.mask, one.bounds, *one.beside, one.transform]
-    return files
+    annotated = (place for one in pair.annotations for _, place in one.files)
+    return [file for file in (pair.slat, texture, *annotated) if file is not None]

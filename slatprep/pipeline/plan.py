@@ -18,7 +18,7 @@ from slatprep.pipeline.before import as_read
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import Names, SourceStore
 from slatprep.pipeline.spool import Spool
-from slatprep.readers.identity import hash_sources
+from slatprep.readers import hash_sources
 from slatprep.records import AssetPair, Place, SourceFile
 from slatprep.storage.faults import reached
 from slatprep.storage.states import noting

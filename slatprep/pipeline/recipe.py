@@ -24,7 +24,7 @@ from slatprep.align import engine_versions
 from slatprep.geometry.voxels import boundary
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
-from slatprep.readers.identity import source_digests
+from slatprep.readers import source_digests
 from slatprep.records import AssetPair, Failed, Finished, SourceFile, Status
 from slatprep.store.record import (
     MAX_WARNINGS,

@@ -1,8 +1,11 @@
-"""Reading the sources: names give the pairs, then each side is read and checked."""
+"""Reading the sources: names give the pairs, then each side is read and checked, or hashed."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -15,19 +18,30 @@ from slatprep.readers.adapters import latent_adapter, made_by, source_adapter
 from slatprep.readers.contents import contents_of
 from slatprep.readers.files import ArraySpec, load_source, npy_array, refusing, require_complete
 from slatprep.readers.pairing import discover
-from slatprep.readers.slat import read_slat
+from slatprep.readers.slat import read_slat, texture_of
 from slatprep.readers.slat_files import SlatFile, discover_slats
-from slatprep.readers.values import require_plausible
-from slatprep.records import AssetPair, MaterialField, Place, SourceFile, StructuredLatents
+from slatprep.records import (
+    TRELLIS,
+    AssetPair,
+    MaterialField,
+    Place,
+    SourceFile,
+    SourceRoots,
+    StructuredLatents,
+    Units,
+)
 
 __all__ = [
     "SlatFile",
     "contents_of",
     "discover",
     "discover_slats",
+    "hash_sources",
     "read_field",
     "read_latents",
     "read_slat",
+    "reading_of",
+    "source_digests",
 ]
 
 
@@ -55,12 +69,6 @@ def read_field(
         If a file cannot be used; the message names file, value and voxel.
     """
     field = source_adapter(pair.roots.adapter).read(pair, max_unphysical)
-    if made_by("slatprep.sources", pair.roots.adapter):
-        roots, where = pair.roots, pair.grid or pair.roots.pixieverse
-        values, classes = field.properties.copy(), field.material if field.classified else None
-        held = values, classes, field.table, roots.contents.classes
-        told = require_plausible(where, *held, roots)
-        field = replace(field, properties=values, warnings=(*field.warnings, *told))
     if pair.transform is not None:
         frame, source = _read_transform(pair.transform, pair.roots.pixieverse)
         field = replace(field, frame=frame, sources=(*field.sources, source))
@@ -120,3 +128,89 @@ def _read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], Sour
     except ValueError as error:
         raise InputError(path, str(error), _EXPECTED) from None
     return matrix, source
+
+
+def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
+    """Hash the files of a pair, in the order in which the readers name them.
+
+    Returns what `read_field` and `read_latents` would record as sources, and their digests by
+    role. Of several annotations of an object, those that can be read are hashed. InputError if
+    there is none.
+    """
+    sources: list[SourceFile] = []
+    digests: dict[str, str] = {}
+    faults: list[InputError] = []
+    found: Place | None = None
+    for one in pair.annotations:
+        label = f" {one.sample}" if pair.others else ""
+        try:
+            _, slat = require_complete(one)
+            own, found = _hash_annotation(one), slat
+        except InputError as error:
+            faults.append(error)
+            digests[f"grid{label}"] = "unreadable"
+            continue
+        for role, digest in (source_digests(own) | reading_of(one.roots)).items():
+            digests[role + label] = digest
+        sources += [file for file in own if file not in sources]
+    if found is None:
+        raise faults[0]
+    files, shared = _hash_slat(pair, found)
+    return (*sources, *files), digests | source_digests(files, shared)
+
+
+def _hash_annotation(pair: AssetPair) -> tuple[SourceFile, ...]:
+    sources = []
+    for role, path in pair.files:
+        # Bounds are not needed: the reader goes on without them, too.
+        with suppress(*([InputError] if role == "bounds" else [])):
+            sources.append(load_source(path, pair.roots.pixieverse, role)[1])
+    return pair.roots.numbered(sources)
+
+
+def _hash_slat(
+    pair: AssetPair, slat: Place
+) -> tuple[tuple[SourceFile, ...], StructuredLatents | None]:
+    """Return the files of the latents; and these, where a file holds those of others as well."""
+    space, root = pair.roots.contents.latents, pair.roots.slat
+    if pair.slat_group:
+        latents = read_slat(slat, root, pair.slat_group, space)
+        return latents.sources, latents
+    files = [("slat", slat), ("texture", texture_of(slat, space))]
+    return tuple(load_source(path, root, role)[1] for role, path in files if path), None
+
+
+def reading_of(roots: SourceRoots) -> dict[str, str]:
+    """Return which options, besides the bytes, decide how files are read; empty by default."""
+    space, reading = roots.contents.latents, {}
+    if roots.adapter != SourceRoots.adapter:
+        reading["adapter"] = f"{roots.adapter} {made_by('slatprep.sources', roots.adapter)}"
+    if (space.channels, space.resolution) != (TRELLIS.channels, TRELLIS.resolution):
+        own = made_by("slatprep.latents", space.encoder)
+        reading["encoder"] = f"{space.encoder} {space.channels} {space.resolution} {own}"
+    if roots.units != Units():
+        reading["units"] = f"{roots.units.youngs_modulus}, {roots.units.density}"
+    if roots.plausibility != SourceRoots.plausibility:
+        reading["plausibility"] = roots.plausibility
+    return reading
+
+
+def source_digests(
+    sources: Iterable[SourceFile], shared: StructuredLatents | None = None
+) -> dict[str, str]:
+    """Return the digest of the content by role.
+
+    `shared` is given where a file holds the latents of many assets. Their digest then replaces
+    the file's, which changes with every asset added.
+    """
+    digests: dict[str, str] = {}
+    for source in sources:
+        before = digests.get(source.role)
+        # Of several files of a role, such as the meshes of parts, every one counts.
+        several = f"{before} {source.sha256}".encode()
+        digests[source.role] = hashlib.sha256(several).hexdigest() if before else source.sha256
+    if shared is not None:
+        digest = hashlib.sha256(shared.coords.tobytes())
+        digest.update(shared.feats.tobytes())
+        digests["slat"] = digest.hexdigest()
+    return digests

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from slatprep import records
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
-from slatprep.readers.foreign import guarded
+from slatprep.readers.foreign import ForeignLatents, ForeignSource
 from slatprep.readers.patterns import find_files, list_below, tried_names
 from slatprep.storage.files import Listing
 
@@ -56,7 +56,8 @@ class SourceAdapter(Protocol):
         """Return what the source holds; a build asks once, before anything is read."""
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
-        """Yield its fields; `find_by_pattern` is enough where only names matter."""
+        """Yield its fields; where only names matter, as here, `find_by_pattern` is enough."""
+        return find_by_pattern(patterns_of(self, source), listing, {})
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read the field at ``pair.grid`` in SI units; raise `InputError` if that fails."""
@@ -135,7 +136,10 @@ def _loaded(group: str, name: str) -> Any:
         adapter = made()
     except (Exception, SystemExit) as error:  # Another package's code may raise anything.
         raise ConfigError(f"adapter {name!r} ({where}) cannot be loaded: {error!r}") from error
-    return adapter if package is None else guarded(group, adapter, name, package or where)
+    if package is None:
+        return adapter
+    guarded = ForeignSource if group == "slatprep.sources" else ForeignLatents
+    return guarded(adapter, name, package or where)
 
 
 @lru_cache(maxsize=2)

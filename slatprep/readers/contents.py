@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters, SlatSource
 from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, source_adapter
+from slatprep.readers.files import refusing
 from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
 from slatprep.storage.documents import read_document
 from slatprep.storage.place import place_of
@@ -104,15 +105,10 @@ def _read_space(path: Place) -> LatentSpace:
             f"slat.encoder: there is no {str(path)!r}; expected {known}, or a JSON "
             "file that describes another"
         )
-    try:
+    expected = "encoder, channels, resolution, and mean and std of each channel if they are known"
+    with refusing(path, "describes no encoder", expected, ConfigError):
         document = json.dumps(read_document(path, _MAX_BYTES))
         space: LatentSpace = TypeAdapter(LatentSpace).validate_json(document)
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ConfigError(
-            f"{path}: describes no encoder ({reason}); expected encoder, channels, resolution, and "
-            "mean and std of each channel if they are known"
-        ) from None
     return space
 
 

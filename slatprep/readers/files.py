@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, MissingPartnerError, StoreError
+from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
 from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile
 from slatprep.storage.place import storage_of
 
@@ -59,13 +59,19 @@ _DAMAGE = (
 
 
 @contextmanager
-def refusing(where: str | Place, fault: str, expected: str) -> Iterator[None]:
-    """Turn what libraries raise for damaged bytes into an `InputError` that gives their reason."""
+def refusing(
+    where: str | Place, fault: str, expected: str, kind: type[SlatprepError] = InputError
+) -> Iterator[None]:
+    """Turn what libraries raise for damaged bytes into an error that gives their reason.
+
+    It is an `InputError`, or, with its words, one of another `kind`.
+    """
     try:
         yield
     except _DAMAGE as error:
-        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
-        raise InputError(where, f"{fault} ({reason})", expected) from None
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        refused = InputError(where, f"{fault} ({reason})", expected)
+        raise (refused if kind is InputError else kind(str(refused))) from None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from slatprep import records
 from slatprep.errors import InputError, SlatprepError
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
+from slatprep.readers.values import require_plausible
 from slatprep.records.sources import ROLES
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
 from slatprep.storage.files import Listing
@@ -43,7 +44,7 @@ def _is_count(value: object) -> bool:
 
 @dataclass(frozen=True)
 class _Foreign:
-    """An adapter, its name, and its package with its version."""
+    """An adapter, its name, and its package with its version; its errors name them."""
 
     adapter: Any
     name: str
@@ -134,7 +135,7 @@ class ForeignSource(_Foreign):
             yield found
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
-        """Read a field and check it."""
+        """Read a field, check it, and hold its values against materials."""
         with self._blamed():
             field: records.MaterialField = self.adapter.read(pair, max_unphysical)
             self._require(
@@ -169,7 +170,10 @@ class ForeignSource(_Foreign):
             self._require(_is_count(field.unphysical), f"{field.unphysical!r} unphysical voxels")
             orjson.dumps(field.bounds)
             self._require_told(field)
-            return field
+        where, classes = pair.grid or pair.roots.pixieverse, contents.classes
+        values, material = field.properties.copy(), field.material if field.classified else None
+        told = require_plausible(where, values, material, table, classes, pair.roots)
+        return replace(field, properties=values, warnings=(*field.warnings, *told))
 
 
 class ForeignLatents(_Foreign):
@@ -211,12 +215,3 @@ class ForeignLatents(_Foreign):
             self._require(type(read.standardised) is bool, told)
             self._require_told(read)
             return read
-
-
-def guarded(group: str, adapter: Any, name: str, package: str) -> ForeignSource | ForeignLatents:
-    """Wrap an adapter of another package so that errors name it and its package.
-
-    `group` is ``slatprep.sources`` or ``slatprep.latents``; `package` includes the version.
-    """
-    kind = ForeignSource if group == "slatprep.sources" else ForeignLatents
-    return kind(adapter, name, package)

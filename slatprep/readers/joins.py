@@ -12,7 +12,7 @@ from itertools import chain
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters
 from slatprep.records import MAX_NAME_BYTES, AssetPair, Place
-from slatprep.storage.documents import unique
+from slatprep.storage.documents import read_bounded, unique
 from slatprep.storage.place import storage_of
 
 MAX_JSON_BYTES = 256 * 2**20
@@ -75,10 +75,7 @@ def read_categories(path: Place) -> dict[str, str]:
     Raises ConfigError if the file cannot be read or an entry has no ``obj_class``.
     """
     try:
-        data = storage_of(path).read(MAX_JSON_BYTES)
-        if len(data) > MAX_JSON_BYTES:
-            raise ConfigError(f"{path}: is larger than {MAX_JSON_BYTES >> 20} MiB")
-        entries = json.loads(data, object_pairs_hook=unique)
+        entries = json.loads(read_bounded(path, MAX_JSON_BYTES), object_pairs_hook=unique)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as JSON ({error})") from None
     if not isinstance(entries, dict):

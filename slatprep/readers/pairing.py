@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, groupby
+from itertools import chain, groupby, product
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
@@ -102,9 +102,7 @@ def discover(
     grids, slats = each[0], find_slats(slat, one_file)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
-    rows = list(_rows(grids, slats, claims))
-    if pixieverse.samples == "all":
-        rows = [own for row in rows for own in _rows_by_sample(row, grids)]
+    rows = list(_rows(grids, slats, claims, each_sample=pixieverse.samples == "all"))
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     folder = slat.root.parent if one_file else slat.root
     contents, cases = contents_of(parameters), by_case(grids, slats)
@@ -139,8 +137,13 @@ def _rows(
     grids: Mapping[str, list[adapters.FoundField]],
     slats: Mapping[str, list[NamedSlat]],
     claims: Mapping[str, list[tuple[str, str]]],
+    *,
+    each_sample: bool,
 ) -> Iterator[_Row]:
-    """Join objects and SLATs: by the map where it names them, by equal id otherwise."""
+    """Join objects and SLATs: by the map where it names them, by equal id otherwise.
+
+    Of an object with several samples, `each_sample` asks for a row for each.
+    """
     claimed = {slat_id for named in claims.values() for slat_id, _ in named}
     for object_id in {*grids, *claims, *(slats.keys() - claimed)}:
         labelled: dict[str, list[NamedSlat]] = {}
@@ -148,20 +151,12 @@ def _rows(
             labelled.setdefault(label, []).append(slat)
         if len(labelled) <= 1:
             labelled = {"": [slat for group in labelled.values() for slat in group]}
-        for label, group in labelled.items():
-            asset_id = f"{object_id}.{label}" if label else object_id
-            yield _Row(encoded(asset_id), object_id, label, ordered(group))
-
-
-def _rows_by_sample(row: _Row, grids: Mapping[str, list[adapters.FoundField]]) -> Iterator[_Row]:
-    """Yield a row for each sample of an object that has several."""
-    samples = {grid.sample for grid in grids.get(row.object_id, ())}
-    if len(samples) < 2:
-        yield row
-        return
-    for sample in sorted(samples):
-        label = f"{row.asset_id}.{encoded(f'sample_{sample}')}"
-        yield replace(row, asset_id=label, sample=sample)
+        samples = {grid.sample for grid in grids.get(object_id, ())} if each_sample else set()
+        apart: list[str | None] = [*sorted(samples)] if len(samples) > 1 else [None]
+        for (label, group), sample in product(labelled.items(), apart):
+            parts = object_id, label, "" if sample is None else f"sample_{sample}"
+            asset_id = encoded(".".join(filter(None, parts)))
+            yield _Row(asset_id, object_id, label, ordered(group), sample)
 
 
 def _slats_of(

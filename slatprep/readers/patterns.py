@@ -190,6 +190,13 @@ def _walk(
             yield Found(known | fields, prefix + name)
 
 
+def held_names(files: Collection[str], folders: Collection[str]) -> str:
+    """Say what lies directly in a folder, in a few names."""
+    names = sorted([*files, *folders])
+    more = " and more" if len(names) > 3 else ""
+    return f"it holds {', '.join(names[:3]) or 'nothing'}{more}"
+
+
 def tried_names(patterns: Iterable[str], known: Mapping[str, str]) -> str:
     """Return the names that patterns stand for, as `fill` has them, to print."""
     return ", ".join(fill(pattern, known) for pattern in patterns)

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
-from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
-from slatprep.readers.files import ArraySpec, load_source, npy_array, require_complete
+from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
+from slatprep.readers.files import ArraySpec, load_source, npy_array, refusing, require_complete
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import field_of_voxels
 from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place
@@ -40,7 +40,7 @@ _DENSITY = 2
 _TABLE = tuple(one for one in PROPERTIES if one.name == "density")
 
 
-class PhysXNet:
+class PhysXNet(SourceAdapter):
     """``property/<id>2.npy`` and ``voxels/<id>.ply``, in the frame of the SLAT of the same mesh."""
 
     patterns = ("property/{id}2.npy",)
@@ -57,23 +57,20 @@ class PhysXNet:
                 "meshes, which have no voxels. Use the adapter `parts`, which voxelises them. "
                 "Expected is what PhysX-3D's toolkit makes of it, with property/ and voxels/"
             )
-        for found in find_by_pattern(patterns_of(self, source), listing, {}):
-            beside = f"voxels/{found.object_id}.ply"
-            lacking = (
-                ""
-                if listing.is_file(beside)
-                else (
+        for found in super().find(source, listing):
+            beside, problem = f"voxels/{found.object_id}.ply", found.problem
+            if not problem and not listing.is_file(beside):
+                problem = (
                     f"{source.root / found.path}: nothing says where its rows lie, as there is no "
                     f"{beside}, which PhysX-3D's toolkit writes with it"
                 )
-            )
-            yield replace(found, beside=(beside,), problem=found.problem or lacking)
+            yield replace(found, beside=(beside,), problem=problem)
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
         path, _ = require_complete(pair)
         root, units = pair.roots.pixieverse, pair.roots.units
-        (beside,) = pair.beside or (root / f"voxels/{path.name.removesuffix('2.npy')}.ply",)
+        (beside,) = pair.beside
         data, file = load_source(path, root, "grid")
         rows = npy_array(data, path, _ROWS)
         text, points = load_source(beside, root, "description")
@@ -106,7 +103,7 @@ _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", r
 _MAX_PARTS = 1000
 
 
-class Parts:
+class Parts(SourceAdapter):
     """``finaljson/<id>.json`` and the meshes of its parts, voxelised solid on 64^3."""
 
     patterns = ("finaljson/{id}.json",)
@@ -118,7 +115,7 @@ class Parts:
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Find the fields by the names of their JSON files."""
-        for found in find_by_pattern(patterns_of(self, source), listing, {}):
+        for found in super().find(source, listing):
             yield replace(found, beside=tuple(_meshes_of(found.object_id, listing).values()))
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
@@ -149,16 +146,10 @@ class Parts:
 
 def _parts_of(data: bytes, path: Place) -> list[dict[str, Any]]:
     """Return the parts of a JSON, each with a label."""
-    try:
+    with refusing(path, "is no annotation of parts", 'an object with "parts", each with "label"'):
         parts = orjson.loads(data)["parts"]
         if not all(isinstance(part["label"], int) for part in parts):
-            raise TypeError
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            path,
-            f"is no annotation of parts ({error})",
-            'an object with "parts", each with "label"',
-        ) from None
+            raise TypeError("a label is no integer")
     if not 0 < len(parts) <= _MAX_PARTS:
         raise InputError(path, f"has {len(parts)} parts", f"1 to {_MAX_PARTS}")
     return list(parts)
@@ -196,14 +187,12 @@ def _meshes_of(name: str, listing: Listing) -> dict[str, str]:
 
 def _mesh(path: Place, data: bytes) -> Any:
     """Return the mesh of a part."""
-    try:
+    with refusing(path, "is no mesh", "an OBJ with faces"):
         mesh = _trimesh().load(
             io.BytesIO(data), file_type="obj", force="mesh", process=False, skip_materials=True
         )
         if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
             raise ValueError("it has no faces, or vertices that are not finite")
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-        raise InputError(path, f"is no mesh ({error})", "an OBJ with faces") from None
     return mesh
 
 

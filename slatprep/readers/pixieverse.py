@@ -20,7 +20,7 @@ from slatprep.parameters import PixieverseSource, SampleParameters
 from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern
 from slatprep.readers.values import require_plausible, require_possible, require_prediction
-from slatprep.readers.voxel_sets import half_overflow, physical_rows
+from slatprep.readers.voxel_sets import physical, physical_rows
 from slatprep.records import (
     BACKGROUND,
     MATERIAL_CLASSES,
@@ -86,19 +86,17 @@ def read_grid(
     properties need only be finite. InputError names file, value and voxel.
     """
     path, _ = files.require_complete(pair)
-    data, source = files.load_source(path, pair.roots.pixieverse, "grid")
-    grid = files.npy_array(data, path, GRID)
+    root = pair.roots.pixieverse
+    channels, raw, source = _channels_of(path, root)
     sources = [source]
     warnings: list[str] = []
 
     mask = None
     if pair.mask is not None:
-        data, source = files.load_source(pair.mask, pair.roots.pixieverse, "mask")
+        data, source = files.load_source(pair.mask, root, "mask")
         sources.append(source)
         mask = _read_mask(files.npy_array(data, pair.mask, MASK), pair.mask, warnings)
 
-    raw = grid.shape == _RAW_SHAPE
-    channels = np.moveaxis(grid, -1, 0) if raw else grid
     material = _classes_of(channels, mask, path, warnings)
     occupancy = material != BACKGROUND if mask is None else mask
     if not occupancy.any():
@@ -113,16 +111,13 @@ def read_grid(
     else:
         warnings += require_prediction(path, properties, classes, pair.roots.plausibility)
 
-    def told(row: int, column: int) -> tuple[str, str]:
-        at, one = tuple(map(int, voxels[row])), PROPERTIES[column]
+    def told(row: int, column: int) -> tuple[str, Any]:
+        at = tuple(voxels[row].tolist())
         value = channels[_CHANNEL_ORDER[column]][at]
-        return f"{one.title} {value:g} at annotated voxel {at}{half_overflow(value)}", one.allowed
+        return f"{PROPERTIES[column].title} {value:g} at annotated voxel {at}", value
 
-    fine = np.isfinite(properties)
-    if raw:
-        columns = zip(PROPERTIES, properties.T, strict=True)
-        fine = np.stack([one.physical(values) for one, values in columns]).T
-    keep = physical_rows(path, fine, told, max_unphysical, warnings)
+    fine = physical(properties, PROPERTIES) if raw else np.isfinite(properties)
+    keep = physical_rows(path, fine, PROPERTIES, told, max_unphysical, warnings)
     unphysical = int(np.count_nonzero(~keep))
     if unphysical:
         voxels, properties = voxels[keep], properties[keep]
@@ -131,7 +126,7 @@ def read_grid(
 
     bounds = None
     if pair.bounds is not None:
-        bounds = _read_bounds(pair.bounds, pair.roots.pixieverse, sources, warnings)
+        bounds = _read_bounds(pair.bounds, root, sources, warnings)
     return MaterialField(
         occupancy=occupancy,
         voxels=voxels,
@@ -155,10 +150,7 @@ def read_prediction(
     where no score is the highest, or the id is -1. InputError if the grid has another form or a
     value at one of the voxels cannot be measured.
     """
-    data, _ = files.load_source(path, root, "grid")
-    grid = files.npy_array(data, path, GRID)
-    raw = grid.shape == _RAW_SHAPE
-    channels = np.moveaxis(grid, -1, 0) if raw else grid
+    channels, raw, _ = _channels_of(path, root)
     classes = _classes_of(channels, where, path, [])
     material = np.where(classes == UNLABELLED, BACKGROUND, classes)[where].astype(np.uint8)
     values = _gather(channels, where).astype(np.float64)
@@ -170,7 +162,7 @@ def read_prediction(
         raise InputError(
             path,
             f"{PROPERTY_COLUMNS[column]} {values[row, column]:g} at voxel "
-            f"{tuple(map(int, np.argwhere(where)[row]))}",
+            f"{tuple(np.argwhere(where)[row].tolist())}",
             "finite numbers" + (", none of E and density below 0" if raw else ""),
         )
     if not raw:
@@ -180,6 +172,14 @@ def read_prediction(
     values[:, :2] += _NO_LOG_OF_ZERO
     mapped = normalize.to_mapped(values)
     return np.clip(normalize.normalize_mapped(mapped, normalization), -1, 1), material
+
+
+def _channels_of(path: Place, root: Place) -> tuple[NDArray[Any], bool, SourceFile]:
+    """Return the channels of a grid (4 or 11, 64, 64, 64), whether they are raw, and its file."""
+    data, source = files.load_source(path, root, "grid")
+    grid = files.npy_array(data, path, GRID)
+    raw = grid.shape == _RAW_SHAPE
+    return np.moveaxis(grid, -1, 0) if raw else grid, raw, source
 
 
 def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArray[np.bool_]:
@@ -228,7 +228,7 @@ def _classes_of_scores(
     inside = scores[:, where]
     finite = np.isfinite(inside).all(axis=0)
     if not finite.all():
-        voxel = tuple(int(i) for i in np.argwhere(where)[np.argmin(finite)])
+        voxel = tuple(np.argwhere(where)[np.argmin(finite)].tolist())
         raise InputError(
             path, f"a class score is NaN or infinite at voxel {voxel}", "finite scores"
         )
@@ -318,4 +318,4 @@ def _read_bounds(
 
 def _first(bad: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the index of the first true entry, in C order."""
-    return tuple(int(i) for i in np.unravel_index(int(np.argmax(bad)), bad.shape))
+    return tuple(np.argwhere(bad)[0].tolist())

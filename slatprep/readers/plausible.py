@@ -12,7 +12,7 @@ from functools import partial
 from itertools import permutations, product
 from typing import NamedTuple
 
-from slatprep.records import FACTORS, LOG10, PROPERTIES, Units
+from slatprep.records import LOG10, PROPERTIES, Units, to_si
 
 _EXTENTS = (
     # The softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry and
@@ -210,24 +210,13 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
 
 def _scaled(units: tuple[str, str], part: Part) -> Part:
     """Bring modulus and density from these units to SI units."""
-    modulus, density = units
-    return part._replace(modulus=_si(part.modulus, modulus), density=_si(part.density, density))
-
-
-def _si(value: float, unit: str) -> float:
-    if not unit:
-        return value
-    if unit.startswith(LOG10):
-        return float(10.0**value) if -10 < value < 20 else math.inf
-    return value * FACTORS[unit]
+    modulus, density = map(float, map(to_si, (part.modulus, part.density), units))
+    return part._replace(modulus=modulus, density=density)
 
 
 def _moved(order: Sequence[int], part: Part) -> Part:
     """Undo that column `order[at]` lies where column `at` belongs."""
-    values = [0.0, 0.0, 0.0]
-    for at, k in enumerate(order):
-        values[k] = part.values[at]
-    return Part(part.name, part.share, *values)
+    return Part(part.name, part.share, *(part.values[order.index(k)] for k in range(3)))
 
 
 def _look_normalised(parts: Sequence[Part]) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import source_adapter
-from slatprep.readers.patterns import fill
+from slatprep.readers.patterns import fill, held_names
 from slatprep.records import AssetPair, Place
 from slatprep.storage.archives import is_archive, shown
 from slatprep.storage.members import ArchivePlace, ArchiveTree, fetch
@@ -77,7 +77,7 @@ def fetch_members(pairs: Iterable[AssetPair], note: Callable[[str], None] | None
         for pair in pairs
         if not pair.problem
         for one in pair.annotations
-        for place in (one.grid, one.mask, one.bounds, one.transform)
+        for _, place in one.files
         if isinstance(place, ArchivePlace) and place.archive and place.entry
     ]
     fetch(wanted, _telling("fetched", note))
@@ -126,8 +126,7 @@ def hint_of(source: PixieverseSource) -> str:
             inner += [below.root / name for name in sorted(storage_of(below.root).names()[1])]
     except (OSError, SlatprepError):
         return ""
-    held = ", ".join(sorted([*folders, *files])[:3]) or "nothing"
-    return f"it holds {held}{' and more' if len(files) + len(folders) > 3 else ''}"
+    return held_names(files, folders)
 
 
 def _held_in_archives(place: ArchivePlace) -> str:

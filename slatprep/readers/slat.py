@@ -217,7 +217,7 @@ def check_coords(
         row = int(np.argmax(outside))
         raise InputError(
             where,
-            f"coordinate {_triple(coords[row])} in row {row} is out of range",
+            f"coordinate {tuple(coords[row].tolist())} in row {row} is out of range",
             f"coordinates in 0..{side - 1}{whose}",
         )
     voxels = np.ascontiguousarray(coords).astype(np.uint8)
@@ -228,7 +228,8 @@ def check_coords(
         first, second = np.flatnonzero(flat == flat[rows[0]])[:2]
         raise InputError(
             where,
-            f"coordinate {_triple(voxels[first])} occurs twice, in rows {first} and {second}",
+            f"coordinate {tuple(voxels[first].tolist())} occurs twice, in rows {first} and "
+            f"{second}",
             "each coordinate once",
         )
     return voxels
@@ -243,14 +244,10 @@ def _check_feats(
         latents = np.ascontiguousarray(feats, dtype=np.float32)
     finite = np.isfinite(latents)
     if not finite.all():
-        row, column = (int(i) for i in np.unravel_index(int(np.argmin(finite)), finite.shape))
+        row, column = np.argwhere(~finite)[0].tolist()
         raise InputError(
             where,
             f"feats is {feats[row, column]} in row {row}, channel {column}",
             "finite latents that float32 can hold",
         )
     return latents
-
-
-def _triple(coordinate: NDArray[Any]) -> tuple[int, ...]:
-    return tuple(int(i) for i in coordinate)

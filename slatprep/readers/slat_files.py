@@ -10,7 +10,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers.adapters import latent_adapter
 from slatprep.readers.hdf5 import SUFFIXES
-from slatprep.readers.patterns import find_files, list_below, tried_names
+from slatprep.readers.patterns import find_files, held_names, list_below, tried_names
 from slatprep.records import Place
 from slatprep.storage.archives import is_archive
 from slatprep.storage.place import storage_of
@@ -121,9 +121,7 @@ def _hint(source: SlatSource) -> str:
         return ""
     if archives := sorted(filter(is_archive, files)):
         return f"; it holds {archives[0]}, {_UNPACKED}"
-    held = sorted([*files, *folders])
-    more = " and more" if len(held) > 3 else ""
-    return f"; it holds {', '.join(held[:3]) or 'nothing'}{more}"
+    return f"; {held_names(files, folders)}"
 
 
 def _patterns_of(source: SlatSource) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import CATEGORY, NAMED_SPLITS
-from slatprep.readers.files import ArraySpec, is_text, npy_array
+from slatprep.readers.files import ArraySpec, is_text, npy_array, refusing
 from slatprep.records import Place
 from slatprep.storage.documents import parse_json, read_bounded, unique
 from slatprep.storage.place import place_of
@@ -178,8 +178,8 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
     The file is a JSON object with some of the lists ``train``, ``val`` and ``test``; or a test
     list alone, as JSON, a one-dimensional npy of text, or an id per line. InputError otherwise.
     """
-    try:
-        data = read_id_file(path)
+    data = read_id_file(path)
+    with refusing(path, "cannot be read", _FORMS):
         if path.suffix == ".npy":
             names = npy_array(data, path, _IDS).astype(str)
             if not is_text(names):
@@ -192,8 +192,6 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
             listed = [
                 line.strip() for line in data.decode("utf-8-sig").splitlines() if line.strip()
             ]
-    except ValueError as error:
-        raise InputError(path, f"cannot be read ({error})", _FORMS) from None
     lists = listed if isinstance(listed, dict) else {"test": listed}
     for name, ids in lists.items():
         if name not in SPLITS:

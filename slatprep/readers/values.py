@@ -25,13 +25,13 @@ from slatprep.readers.plausible import (
 from slatprep.records import (
     BACKGROUND,
     FACTORS,
-    LOG10,
     MATERIAL_CLASSES,
     PROPERTIES,
     Place,
     Property,
     SourceRoots,
     Units,
+    to_si,
 )
 
 _PREDICTED = 1.5
@@ -51,12 +51,9 @@ def _bring_to_si(values: NDArray[np.float32], table: Sequence[Property], units: 
     """Bring values (K, P) to SI units, in place, where a unit is stated for a column of those."""
     for column, one in enumerate(table):
         unit = units.of(one.name)
-        if not unit or FACTORS.get(one.unit) != 1.0:
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            own = values[:, column].astype(np.float64)
-            own = 10.0**own if unit.startswith(LOG10) else own * FACTORS[unit]
-            values[:, column] = own.astype(np.float32)
+        if unit and FACTORS.get(one.unit) == 1.0:
+            with np.errstate(over="ignore"):
+                values[:, column] = to_si(values[:, column], unit)
 
 
 def require_plausible(
@@ -165,7 +162,7 @@ def _parts(
     for k, known in enumerate(PROPERTIES):
         column, unit = columns.get(known.name, (-1, ""))
         if column >= 0 and unit in ("1", *FACTORS):
-            own[:, k] = sample[:, column] * FACTORS.get(unit, 1.0)
+            own[:, k] = to_si(sample[:, column], unit)
     ids = np.zeros(len(own), int) if material is None else material[::step].astype(int)
     parts = []
     for k in np.unique(ids):

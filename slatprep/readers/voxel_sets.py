@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep import records
 from slatprep.errors import InputError
-from slatprep.geometry.voxels import voxels_of
+from slatprep.geometry.voxels import flat_index, voxels_of
 from slatprep.normalize import from_mapped, to_mapped
 from slatprep.readers.values import require_plausible
 
@@ -59,19 +59,17 @@ def field_of_voxels(
     if roots is not None:
         labels = None if material is None else own
         notes += require_plausible(where, values, labels, table, names, roots)
-    fine = np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)
 
-    def told(row: int, column: int) -> tuple[str, str]:
-        one = table[column]
+    def told(row: int, column: int) -> tuple[str, Any]:
         value = np.asarray(properties)[row, column]
-        return f"{one.name} {value:g} in row {row}{half_overflow(value)}", one.allowed
+        return f"{table[column].name} {value:g} in row {row}", value
 
-    keep = physical_rows(where, fine, told, max_unphysical, notes)
+    keep = physical_rows(where, physical(values, table), table, told, max_unphysical, notes)
 
     side = min(resolution, records.RESOLUTION)
     if resolution > records.RESOLUTION:
         cells = (2 * cells + 1) * records.RESOLUTION // (2 * resolution)
-    flat = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
+    flat = flat_index(cells, side)
     cell, labels, means = _merged(flat[keep], own[keep], values[keep], table)
     if len(cell) < np.count_nonzero(keep):
         notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(cell)} of {side}^3")
@@ -115,36 +113,35 @@ def _cells_of(
     return index.astype(np.int64), resolution
 
 
-def half_overflow(value: Any) -> str:
-    """Say that float16 overflowed, where a value is infinite for that; empty otherwise."""
-    if getattr(value, "dtype", None) == np.float16 and np.isinf(value):
-        return ", as float16 holds nothing above 65,504: save it as float32"
-    return ""
+def physical(values: NDArray[np.float32], table: Sequence[records.Property]) -> NDArray[np.bool_]:
+    """Return which values (K, P) a material can have."""
+    return np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)
 
 
 def physical_rows(
     where: str | records.Place,
     fine: NDArray[np.bool_],
-    told: Callable[[int, int], tuple[str, str]],
+    table: Sequence[records.Property],
+    told: Callable[[int, int], tuple[str, Any]],
     max_unphysical: float,
     notes: list[str],
 ) -> NDArray[np.bool_]:
     """Return which annotated voxels (K,) are physical; refuse too many others, note a few.
 
-    `fine` (K, P) says it of each property. `told` returns, for a row and a column, the value that
-    is there and the expected one.
+    `fine` (K, P) says it of each property. `told` returns, for a row and a column, what lies
+    there in words, and its value in the file.
     """
     keep = np.asarray(fine.all(axis=1))
     bad = int(np.count_nonzero(~keep))
     if bad:
-        row, column = (int(i) for i in np.argwhere(~fine)[0])
-        what, expected = told(row, column)
+        row, column = np.argwhere(~fine)[0].tolist()
+        what, value = told(row, column)
+        if getattr(value, "dtype", None) == np.float16 and np.isinf(value):
+            what += ", as float16 holds nothing above 65,504: save it as float32"
         if bad == len(keep) or bad > max_unphysical * len(keep):
-            raise InputError(
-                where,
-                f"{bad} of {len(keep)} annotated voxels are unphysical, the first by {what}",
-                f"{expected}, in all but {100 * max_unphysical:.4g}% (sample.max_unphysical)",
-            )
+            fault = f"{bad} of {len(keep)} annotated voxels are unphysical, the first by {what}"
+            most = f"in all but {100 * max_unphysical:.4g}% (sample.max_unphysical)"
+            raise InputError(where, fault, f"{table[column].allowed}, {most}")
         notes.append(f"{bad} voxels are unphysical, the first by {what}; not annotated")
     return keep
 

@@ -15,7 +15,7 @@ import json
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -26,7 +26,7 @@ from slatprep import records
 from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers import files
-from slatprep.readers.adapters import FoundField, Holding, find_by_pattern, patterns_of
+from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
 from slatprep.readers.hdf5 import SUFFIXES, load_datasets
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
@@ -85,7 +85,7 @@ class _Description:
         return known if self.classes == known[: records.BACKGROUND] else self.classes
 
 
-class PlainVoxels:
+class PlainVoxels(SourceAdapter):
     """``<id>.npz``, ``.h5``, ``.hdf5`` or ``.zarr``: ``voxels`` (K, 3), a column per property.
 
     Sources with classes also have ``material``. In an ``<id>.ply`` the voxels are the vertices.
@@ -100,7 +100,7 @@ class PlainVoxels:
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Find the fields by the names of their files."""
-        for found in find_by_pattern(patterns_of(self, source), listing, {}):
+        for found in super().find(source, listing):
             path = found.path.removesuffix(_GROUP)
             yield replace(found, path=path, beside=(DESCRIPTION,))
 
@@ -160,7 +160,11 @@ def _ply_arrays(
 def _parsed(text: bytes, where: str) -> _Description:
     from pydantic import TypeAdapter
 
-    try:
+    expected = (
+        "properties with name, unit and scale, and classes, resolution and aligned where they are "
+        "not true, 64, false"
+    )
+    with files.refusing(where, "does not describe plain voxels", expected, ConfigError):
         read: _Description = TypeAdapter(_Description).validate_json(text, strict=True)
         if len({one.name for one in read.properties}) < len(read.properties):
             raise ValueError("a property has two columns")
@@ -171,27 +175,17 @@ def _parsed(text: bytes, where: str) -> _Description:
             raise ValueError(
                 f"there are {len(named)} classes, not 1 to {records.MANY_BACKGROUND} of a name each"
             )
-    except ValueError as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ConfigError(
-            f"{where}: does not describe plain voxels ({reason}); expected properties with name, "
-            "unit and scale, and classes, resolution and aligned where they are not true, 64, false"
-        ) from None
     return read
 
 
 def _description(root: records.Place) -> _Description:
     path = root / DESCRIPTION
-    try:
+    expected = "a file that says what the columns are"
+    with files.refusing(path, "cannot be read", expected, ConfigError):
         text = read_bounded(path, _MAX_BYTES)
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{path}: cannot be read ({error}); expected a file that says what the columns are"
-        ) from None
     return _parsed(text, str(path))
 
 
-_MAX_METADATA = 2**16
 _ZARR_EXPECTED = (
     "a Zarr group of format 3 with an array for each of {}, not in shards, packed with zstd, "
     "blosc or nothing; or npz, HDF5 or PLY"
@@ -215,52 +209,39 @@ def _group_arrays(
     value. InputError if an array is missing, not as specified, lacks a chunk, or uses another
     compression.
     """
-    expected = _ZARR_EXPECTED.format(", ".join(specs))
+    expected, arrays = _ZARR_EXPECTED.format(", ".join(specs)), {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        return {
-            name: _array(archive, f"{where} [{name}]", name, spec, expected, name in empty)
-            for name, spec in specs.items()
-        }
+        there = set(archive.namelist())
 
+        def fetch(name: str, key: str, most: int) -> bytes | None:
+            path = f"{name}/{key}"
+            if path not in there:
+                if name in empty:
+                    return None
+                fault = f"its chunk {path} is missing"
+                raise InputError(f"{where} [{name}]", fault, _ALL_CHUNKS.format(name))
+            if archive.getinfo(path).file_size > most:
+                raise ValueError(f"{key} has {archive.getinfo(path).file_size} bytes")
+            return archive.read(path)
 
-def _array(
-    archive: zipfile.ZipFile,
-    where: str,
-    name: str,
-    spec: files.ArraySpec,
-    expected: str,
-    empty: bool,
-) -> NDArray[Any]:
-    def fetch(key: str, most: int) -> bytes | None:
-        try:
-            chunk = archive.getinfo(f"{name}/{key}")
-        except KeyError:
-            if empty or key == "zarr.json":
-                return None
-            raise InputError(
-                where, f"its chunk {name}/{key} is missing", _ALL_CHUNKS.format(name)
-            ) from None
-        if chunk.file_size > most:
-            raise ValueError(f"{key} has {chunk.file_size} bytes")
-        return archive.read(chunk)
-
-    with files.refusing(where, "is no readable array", expected):
-        text = fetch("zarr.json", _MAX_METADATA)
-        if text is None:
-            raise InputError(where, "is not in it", expected)
-        metadata = json.loads(text)
-        spec.check(where, *array_form(metadata))
-        try:
-            return read_chunks(metadata, fetch)
-        except StoreError as error:
-            raise ValueError(str(error)) from None
+        for name, spec in specs.items():
+            if f"{name}/zarr.json" not in there:
+                raise InputError(f"{where} [{name}]", "is not in it", expected)
+            with files.refusing(f"{where} [{name}]", "is no readable array", expected):
+                metadata = json.loads(fetch(name, "zarr.json", _MAX_BYTES) or b"")
+                spec.check(f"{where} [{name}]", *array_form(metadata))
+                try:
+                    arrays[name] = read_chunks(metadata, partial(fetch, name))
+                except StoreError as error:
+                    raise ValueError(str(error)) from None
+    return arrays
 
 
 _VOMP = {"voxel_data": files.ArraySpec(shapes=((None,),), kinds="V")}
 _VOMP_SIDE = 64
 
 
-class VoMP:
+class VoMP(SourceAdapter):
     """``voxels/<id>_with_materials.npz``: x, y, z in the unit cube, E, density and nu in SI units.
 
     A SLAT encoded from the same mesh lies in the same frame. The field records this frame, and
@@ -272,10 +253,6 @@ class VoMP:
     def describe(self, source: PixieverseSource) -> Holding:
         """Say that there are PixieVerse's three properties and no classes."""
         return Holding(records.PROPERTIES, ())
-
-    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
-        """Find the fields by the names of their files."""
-        return find_by_pattern(patterns_of(self, source), listing, {})
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""

@@ -50,6 +50,7 @@ from slatprep.records.sources import (
     SourceRoots,
     StructuredLatents,
     Units,
+    to_si,
 )
 from slatprep.records.tables import (
     BACKGROUND,

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import IO, Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from slatprep.records.json_types import Count, Digest, one_of
 from slatprep.records.tables import (
@@ -100,6 +100,15 @@ LOG10 = "log10 "
 
 FACTORS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "kg/m^3": 1.0, "g/cm^3": 1e3}
 """What a value in a unit is multiplied by to be in SI units."""
+
+
+def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
+    """Return values of any shape in SI units; those without a known unit stay as they are."""
+    given = np.asarray(values, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        if unit.startswith(LOG10):
+            return np.asarray(10.0**given)
+        return np.asarray(given * FACTORS.get(unit, 1.0))
 
 
 @dataclass(frozen=True)
@@ -197,6 +206,14 @@ class AssetPair:
     def annotations(self) -> tuple[AssetPair, ...]:
         """Every annotation of the object that goes into the row, this one first."""
         return (self, *self.others)
+
+    @property
+    def files(self) -> tuple[tuple[str, Place], ...]:
+        """Role and place of each file of this annotation, in the order in which they are read."""
+        beside = (("description", place) for place in self.beside)
+        files = ("grid", self.grid), ("mask", self.mask), ("bounds", self.bounds), *beside
+        files = *files, ("transform", self.transform)
+        return tuple((role, place) for role, place in files if place is not None)
 
 
 @dataclass(frozen=True, eq=False)

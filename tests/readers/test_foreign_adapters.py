@@ -15,129 +15,109 @@ from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents
 from slatprep.readers.adapters import FoundField, Holding, source_adapter
 from slatprep.readers.contents import latent_space
-from slatprep.readers.foreign import guarded
+from slatprep.readers.foreign import ForeignLatents, ForeignSource
 from slatprep.readers.pixieverse import PixieVerse
-from slatprep.records import PROPERTIES, TRELLIS, AssetPair
+from slatprep.records import PROPERTIES, TRELLIS
 
-MakePair = Callable[..., AssetPair]
 THEIRS = r"adapter 'mine' of theirs 1\.0: (gives|raises) "
 
-FIELDS: dict[str, Callable[[Any], Any]] = {
-    "nothing": lambda field: None,
-    "a list": lambda field: [1, 2],
-    "NaN": lambda field: replace(field, properties=field.properties * np.nan),
-    "below 0": lambda field: replace(field, properties=-field.properties),
-    "infinite": lambda field: replace(field, properties=field.properties + np.float32(np.inf)),
-    "another type": lambda field: replace(field, properties=field.properties.astype(np.float64)),
-    "a column less": lambda field: replace(field, properties=field.properties[:, :2]),
-    "a row less": lambda field: replace(field, properties=field.properties[:-1]),
-    "another table": lambda f: replace(f, table=f.table[:1], properties=f.properties[:, :1].copy()),
-    "no such class": lambda field: replace(field, material=field.material + np.uint8(100)),
-    "classes of none": lambda f: replace(
-        f, classified=False, material=f.material * 0 + np.uint8(1)
-    ),
-    "out of the grid": lambda field: replace(field, voxels=field.voxels + np.uint8(70)),
-    "one voxel": lambda field: replace(field, voxels=np.zeros_like(field.voxels)),
-    "not occupied": lambda field: replace(field, occupancy=np.zeros_like(field.occupancy)),
-    "another grid": lambda field: replace(field, occupancy=np.ones((32, 32, 32), bool)),
-    "empty": lambda f: replace(
-        f, voxels=f.voxels[:0], material=f.material[:0], properties=f.properties[:0]
-    ),
-    "no files": lambda field: replace(field, sources=()),
-    "warnings of objects": lambda field: replace(field, warnings=(object(),)),
-    "bounds of objects": lambda field: replace(field, bounds={"a": object()}),
-    "a path of surrogates": lambda field: replace(
-        field, sources=(replace(field.sources[0], path="a\udcff"),)
-    ),
-    "a size beyond numbers": lambda field: replace(
-        field, sources=(replace(field.sources[0], size=2**70),)
-    ),
-    "warnings of surrogates": lambda field: replace(field, warnings=("a\udcff",)),
-    "a warning without end": lambda field: replace(field, warnings=("a" * 10_000_000,)),
-    "more unphysical voxels than numbers": lambda field: replace(field, unphysical=2**70),
-    "unphysical voxels below 0": lambda field: replace(field, unphysical=-1),
-    "a frame of NaN": lambda field: replace(field, frame=np.full((4, 4), np.nan)),
+
+def source(**methods: Any) -> Any:
+    return ForeignSource(SimpleNamespace(**methods), "mine", "theirs 1.0")
+
+
+def of_file(read: Any, **changes: object) -> dict[str, Any]:
+    return {"sources": (replace(read.sources[0], **changes),)}
+
+
+Change = Callable[[Any], dict[str, Any] | None]
+BAD_FIELDS: dict[str, Change] = {
+    "nothing": lambda f: None,
+    "NaN": lambda f: {"properties": f.properties * np.nan},
+    "below 0": lambda f: {"properties": -f.properties},
+    "infinite": lambda f: {"properties": f.properties + np.float32(np.inf)},
+    "another type": lambda f: {"properties": f.properties.astype(np.float64)},
+    "a column less": lambda f: {"properties": f.properties[:, :2]},
+    "a row less": lambda f: {"properties": f.properties[:-1]},
+    "another table": lambda f: {"table": f.table[:1], "properties": f.properties[:, :1].copy()},
+    "no such class": lambda f: {"material": f.material + np.uint8(100)},
+    "classes of none": lambda f: {"classified": False, "material": f.material * 0 + np.uint8(1)},
+    "out of the grid": lambda f: {"voxels": f.voxels + np.uint8(70)},
+    "one voxel": lambda f: {"voxels": np.zeros_like(f.voxels)},
+    "not occupied": lambda f: {"occupancy": np.zeros_like(f.occupancy)},
+    "another grid": lambda f: {"occupancy": np.ones((32, 32, 32), bool)},
+    "empty": lambda f: {
+        name: getattr(f, name)[:0] for name in ("voxels", "material", "properties")
+    },
+    "no files": lambda f: {"sources": ()},
+    "warnings of objects": lambda f: {"warnings": (object(),)},
+    "bounds of objects": lambda f: {"bounds": {"a": object()}},
+    "a path of surrogates": lambda f: of_file(f, path="a\udcff"),
+    "a size beyond numbers": lambda f: of_file(f, size=2**70),
+    "warnings of surrogates": lambda f: {"warnings": ("a\udcff",)},
+    "a warning without end": lambda f: {"warnings": ("a" * 10_000_000,)},
+    "more unphysical voxels than numbers": lambda f: {"unphysical": 2**70},
+    "unphysical voxels below 0": lambda f: {"unphysical": -1},
+    "a frame of NaN": lambda f: {"frame": np.full((4, 4), np.nan)},
+}
+BAD_SLATS: dict[str, Change] = {
+    "nothing": lambda s: None,
+    "NaN": lambda s: {"feats": s.feats * np.nan},
+    "channels": lambda s: {"feats": s.feats[:, :5]},
+    "rows": lambda s: {"feats": s.feats[:-1]},
+    "out of the grid": lambda s: {"coords": s.coords + np.uint8(100)},
+    "another grid": lambda s: {"resolution": 32},
+    "twice": lambda s: {"coords": np.zeros_like(s.coords)},
+    "another type": lambda s: {"coords": s.coords.astype(np.int64)},
+    "no files": lambda s: {"sources": ()},
+    "a digest of bytes": lambda s: of_file(s, sha256=b"0" * 64),
+    "a digest of surrogates": lambda s: of_file(s, sha256="\udcff" * 64),
+    "a role that is none": lambda s: of_file(s, role="script"),
+    "a source that is none": lambda s: of_file(s, source=-1),
+    "standardised perhaps": lambda s: {"standardised": "no"},
+    "a grid without end": lambda s: {"resolution": "x" * 10**6},
 }
 
 
-@pytest.mark.parametrize("case", FIELDS)
+def refused(adapter: Any, *arguments: Any) -> None:
+    """Hold that what an adapter gives is refused, in words that are theirs and few."""
+    with pytest.raises(InputError, match=THEIRS) as caught:
+        adapter.read(*arguments)
+    assert len(str(caught.value).encode()) < 2000
+
+
+@pytest.mark.parametrize("case", BAD_FIELDS)
 def test_a_field_that_is_none_is_refused(make_pair, case):
     pair = make_pair()
     sound = PixieVerse().read(pair, 0.1)
-    adapter = SimpleNamespace(read=lambda *_: FIELDS[case](sound))
-    with pytest.raises(InputError, match=THEIRS):
-        guarded("slatprep.sources", adapter, "mine", "theirs 1.0").read(pair, 0.1)
+    field = source(read=lambda *_: sound).read(pair, 0.1)
+    np.testing.assert_array_equal(field.voxels, sound.voxels)
+    change = BAD_FIELDS[case](sound)
+    refused(source(read=lambda *_: change and replace(sound, **change)), pair, 0.1)
 
 
-def test_a_sound_field_passes(make_pair):
-    pair = make_pair()
-    field = guarded("slatprep.sources", PixieVerse(), "mine", "theirs 1.0").read(pair, 0.1)
-    np.testing.assert_array_equal(field.voxels, PixieVerse().read(pair, 0.1).voxels)
-
-
-SLATS: dict[str, Callable[[Any], Any]] = {
-    "nothing": lambda slat: None,
-    "NaN": lambda slat: replace(slat, feats=slat.feats * np.nan),
-    "channels": lambda slat: replace(slat, feats=slat.feats[:, :5]),
-    "rows": lambda slat: replace(slat, feats=slat.feats[:-1]),
-    "out of the grid": lambda slat: replace(slat, coords=slat.coords + np.uint8(100)),
-    "another grid": lambda slat: replace(slat, resolution=32),
-    "twice": lambda slat: replace(slat, coords=np.zeros_like(slat.coords)),
-    "another type": lambda slat: replace(slat, coords=slat.coords.astype(np.int64)),
-    "no files": lambda slat: replace(slat, sources=()),
-    "warnings of surrogates": lambda slat: replace(slat, warnings=("\udc80",)),
-    "a digest of bytes": lambda slat: of_file(slat, sha256=b"0" * 64),
-    "a digest of surrogates": lambda slat: of_file(slat, sha256="\udcff" * 64),
-    "a role that is none": lambda slat: of_file(slat, role="script"),
-    "a source that is none": lambda slat: of_file(slat, source=-1),
-    "standardised perhaps": lambda slat: replace(slat, standardised="no"),
-    "a grid without end": lambda slat: replace(slat, resolution="x" * 10**6),
-}
-
-
-def of_file(slat: Any, **changes: object) -> Any:
-    return replace(slat, sources=(replace(slat.sources[0], **changes),))
-
-
-@pytest.mark.parametrize("case", SLATS)
+@pytest.mark.parametrize("case", BAD_SLATS)
 def test_latents_that_are_none_are_refused(make_pair, case):
-    pair = make_pair()
-    sound = read_latents(pair)
-    adapter = SimpleNamespace(read=lambda *_: SLATS[case](sound))
-    with pytest.raises(InputError, match=THEIRS) as refused:
-        guarded("slatprep.latents", adapter, "mine", "theirs 1.0").read("a", "b", "", TRELLIS)
-    assert len(str(refused.value).encode()) < 2000
+    sound = read_latents(make_pair())
+    change = BAD_SLATS[case](sound)
+    told = SimpleNamespace(read=lambda *_: change and replace(sound, **change))
+    refused(ForeignLatents(told, "mine", "theirs 1.0"), "a", "b", "", TRELLIS)
 
 
-def _raising(*_: object) -> Any:
-    raise KeyError("boom")
+@pytest.mark.parametrize("error", [KeyError("boom"), SystemExit(3), GeneratorExit()])
+def test_whatever_is_raised_is_theirs(make_pair, error):
+    def call(*_: object) -> Any:
+        raise error
 
-
-def _leaving(*_: object) -> Any:
-    raise SystemExit(3)
-
-
-def _half_found(*_: object) -> Iterator[FoundField]:
-    yield FoundField("a", "a.npy")
-    raise KeyError("boom")
-
-
-def _closing(*_: object) -> Any:
-    raise GeneratorExit
-
-
-@pytest.mark.parametrize("raising", [_raising, _leaving, _closing, None])
-def test_whatever_is_raised_is_theirs(make_pair, raising):
-    told = SimpleNamespace(describe=raising, read=raising, find=raising)
-    adapter: Any = guarded("slatprep.sources", told, "mine", "theirs 1.0")
-    for call in (
+    adapter = source(describe=call, read=call, find=call)
+    for ask in (
         lambda: adapter.describe(None),
         lambda: adapter.read(make_pair(), 0.1),
         lambda: list(adapter.find(None, None)),
         lambda: adapter.patterns,
     ):
         with pytest.raises(InputError, match=THEIRS):
-            call()
+            ask()
 
 
 @pytest.mark.parametrize(
@@ -153,16 +133,19 @@ def test_whatever_is_raised_is_theirs(make_pair, raising):
     ],
 )
 def test_what_a_source_cannot_hold_is_refused(held):
-    told = SimpleNamespace(describe=lambda _: held)
     with pytest.raises(InputError, match=THEIRS):
-        guarded("slatprep.sources", told, "mine", "theirs 1.0").describe(None)  # type: ignore
+        source(describe=lambda _: held).describe(None)
 
 
-@pytest.mark.parametrize("found", [_half_found, lambda *_: None, lambda *_: [5]])
+def _half_found(*_: object) -> Iterator[FoundField]:
+    yield FoundField("a", "a.npy")
+    raise KeyError("boom")
+
+
+@pytest.mark.parametrize("found", [_half_found, lambda *_: None, lambda *_: [5], None])
 def test_what_is_no_field_is_not_found(found):
-    adapter: Any = guarded("slatprep.sources", SimpleNamespace(find=found), "mine", "theirs 1.0")
     with pytest.raises(InputError, match=THEIRS):
-        list(adapter.find(None, None))
+        list(source(find=found).find(None, None))
 
 
 @pytest.fixture

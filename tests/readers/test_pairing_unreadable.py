@@ -57,24 +57,19 @@ def test_a_folder_on_the_way_to_ids_that_cannot_be_listed_is_named(find, tmp_pat
     assert "/y/: cannot be listed" in found["y%2F"].problem
 
 
-NO_FILES = {
-    "loop": (lambda path: path.symlink_to(path.name), "b.npz: cannot be opened"),
-    "broken link": (lambda path: path.symlink_to("gone"), "b.npz: is a link that leads nowhere"),
-    "pipe": (os.mkfifo, "b.npz: is not a regular file"),
-    "device": (lambda path: path.symlink_to("/dev/zero"), "b.npz: leads to /dev/zero, out of"),
-}
-
-
-@pytest.mark.parametrize("kind", NO_FILES)
-def test_what_is_no_file_is_named_by_its_name(find, tmp_path, kind):
-    make, message = NO_FILES[kind]
-    (tmp_path / "slat").mkdir()
-    make(tmp_path / "slat" / "b.npz")
-    first, second = find([grid("a"), grid("b")], ["a.npz"])
+def test_what_is_no_file_is_named_by_its_name(find, tmp_path):
+    slats = tmp_path / "slat"
+    slats.mkdir()
+    for name, target in (("b", "b.npz"), ("c", "gone"), ("e", "/dev/zero")):
+        (slats / f"{name}.npz").symlink_to(target)
+    os.mkfifo(slats / "d.npz")
+    first, *others = find(map(grid, "abcde"), ["a.npz"])
     assert not first.problem
-    assert not second.problem
-    with pytest.raises(InputError, match=message):
-        read_latents(second)
+    messages = "cannot be opened", "is a link that leads nowhere", "is not a regular", "leads to /d"
+    for pair, message in zip(others, messages, strict=True):
+        assert not pair.problem
+        with pytest.raises(InputError, match=f"{pair.asset_id}.npz: {message}"):
+            read_latents(pair)
 
 
 def test_a_mask_that_leads_nowhere_is_no_missing_mask(find, tmp_path):

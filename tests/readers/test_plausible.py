@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from slatprep.errors import InputError
-from slatprep.readers import read_field
-from slatprep.readers.identity import hash_sources
+from slatprep.readers import hash_sources, read_field
 from slatprep.records import Units
 
 JELLY, METAL, SAND, VISPLAS, FLUID, SNOW, STATIONARY = range(7)

@@ -23,6 +23,8 @@ def hdf5_pair(pair, group="", **datasets):
         for name, value in datasets.items():
             if isinstance(value, dict):
                 holder.create_dataset(name, **value)
+            elif isinstance(value, h5py.VirtualLayout):
+                holder.create_virtual_dataset(name, value)
             else:
                 holder[name] = value
     return replace(pair, slat=path, slat_group=group)
@@ -35,43 +37,34 @@ def check(latents):
     np.testing.assert_array_equal(latents.feats, FEATS)
 
 
-@pytest.mark.parametrize("coords", [COORDS, BATCHED], ids=["(N, 3)", "(N, 4)"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64, ">i2"])
-def test_npz(make_pair, coords, dtype):
-    latents = read_latents(make_pair(coords=coords.astype(dtype)))
-    check(latents)
-    assert latents.warnings == ()
+FORMS = {
+    "as they are": {},
+    "of a batch": {"coords": BATCHED},
+    **{f"coords {dtype}": {"coords": COORDS.astype(dtype)} for dtype in ("int32", "int64", ">i2")},
+    "in Fortran's order": {"coords": np.asfortranarray(BATCHED), "feats": np.asfortranarray(FEATS)},
+    # Eighths are exact in each of these.
+    **{f"feats {dtype}": {"feats": FEATS.astype(dtype)} for dtype in ("float16", ">f4", "float64")},
+}
 
 
-def test_compressed_and_fortran_ordered_npz(make_pair):
-    pair = make_pair()
-    np.savez_compressed(
-        pair.slat, coords=np.asfortranarray(BATCHED), feats=np.asfortranarray(FEATS), extra="kept"
-    )
-    check(read_latents(pair))
-
-
-@pytest.mark.parametrize(
-    ("dtype", "warnings"),
-    [(np.float16, ()), (">f4", ()), (np.float64, ("feats: float64 rounded to float32",))],
-)
-def test_feats_of_other_precision(make_pair, dtype, warnings):
-    latents = read_latents(make_pair(feats=FEATS.astype(dtype)))
-    check(latents)  # eighths are exact in each of these
-    assert latents.warnings == warnings
-
-
-@pytest.mark.parametrize("group", ["", "a", "slats/a"])
-@pytest.mark.parametrize("coords", [COORDS, BATCHED], ids=["(N, 3)", "(N, 4)"])
-def test_hdf5(make_pair, group, coords):
-    check(read_latents(hdf5_pair(make_pair(), group, coords=coords, feats=FEATS)))
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_is_read_alike(make_pair, form):
+    arrays, pair = {"coords": COORDS, "feats": FEATS, "extra": "kept", **FORMS[form]}, make_pair()
+    np.savez(pair.slat, **arrays)
+    packed = replace(pair, slat=pair.slat.with_name("b.npz"))
+    np.savez_compressed(packed.slat, **arrays)
+    groups = [hdf5_pair(pair, group, **arrays) for group in ("", "a", "slats/a")]
+    rounded = ("feats: float64 rounded to float32",) if form == "feats float64" else ()
+    for one in (pair, packed, *groups):
+        latents = read_latents(one)
+        check(latents)
+        assert latents.warnings == rounded
 
 
 @pytest.mark.parametrize(
     "options",
     [
         {"compression": "gzip"},
-        {"compression": "gzip", "shuffle": True},
         {"fletcher32": True, "chunks": (2, 5)},
         {"compression": "gzip", "shuffle": True, "fletcher32": True, "chunks": (2, 8)},
         {"chunks": (1, 3)},
@@ -89,9 +82,7 @@ def test_sources(make_pair):
     for each in (pair, shared):
         (source,) = read_latents(each).sources
         data = each.slat.read_bytes()
-        assert source.role == "slat"
-        assert source.path == each.slat.name
-        assert source.size == len(data)
+        assert (source.role, source.path, source.size) == ("slat", each.slat.name, len(data))
         assert source.sha256 == hashlib.sha256(data).hexdigest()
 
 
@@ -111,76 +102,53 @@ def _set(array, index, value):
     return changed
 
 
-BAD_ARRAYS = {
-    "coords shape": ({"coords": COORDS[:, :2]}, "shape (3, 2)", "(N <= 262144, 3)"),
-    "coords flat": ({"coords": COORDS.ravel()}, "shape (9,)", "(N <= 262144, 4)"),
-    "coords float": ({"coords": COORDS.astype(np.float32)}, "dtype <f4", "integer"),
-    "coords bool": ({"coords": COORDS > 0}, "dtype |b1", "integer"),
-    "feats shape": ({"feats": FEATS[:, :7]}, "shape (3, 7)", "(N <= 262144, 8)"),
-    "feats int": ({"feats": FEATS.astype(np.int32)}, "dtype <i4", "floating-point"),
-    "lengths": ({"feats": FEATS[:2]}, "3 rows of coords but 2 of feats", "one latent per voxel"),
-    "empty": ({"coords": COORDS[:0], "feats": FEATS[:0]}, "SLAT is empty", "at least one voxel"),
-    "batch": ({"coords": _set(BATCHED, (2, 0), 1)}, "batch index 1 in row 2", "one asset"),
-    "negative": (
-        {"coords": _set(BATCHED, (1, 2), -1)},
-        "coordinate (63, -1, 2) in row 1 is out of range",
-        "0..63",
-    ),
-    "wraps in uint8": (
-        {"coords": _set(BATCHED, (2, 1), 256)},
-        "coordinate (256, 63, 63) in row 2 is out of range",
-        "0..63",
-    ),
-    "duplicate": (
-        {"coords": _set(COORDS, 2, COORDS[0])},
-        "coordinate (0, 0, 0) occurs twice, in rows 0 and 2",
-        "once",
-    ),
-    "infinity": ({"feats": _set(FEATS, (0, 0), -np.inf)}, "feats is -inf in row 0", "finite"),
-    "too large": (
+OUT = "coordinate ({}) in row {} is out of range"
+BAD_ARRAYS = [
+    ({"coords": COORDS[:, :2]}, "shape (3, 2)", "(N <= 262144, 3)"),
+    ({"coords": COORDS.ravel()}, "shape (9,)", "(N <= 262144, 4)"),
+    ({"coords": COORDS.astype(np.float32)}, "dtype <f4", "integer"),
+    ({"coords": COORDS > 0}, "dtype |b1", "integer"),
+    ({"feats": FEATS[:, :7]}, "shape (3, 7)", "(N <= 262144, 8)"),
+    ({"feats": FEATS.astype(np.int32)}, "dtype <i4", "floating-point"),
+    ({"feats": FEATS[:2]}, "3 rows of coords but 2 of feats", "one latent per voxel"),
+    ({"coords": COORDS[:0], "feats": FEATS[:0]}, "SLAT is empty", "at least one voxel"),
+    ({"coords": _set(BATCHED, (2, 0), 1)}, "batch index 1 in row 2", "one asset"),
+    ({"coords": _set(BATCHED, (1, 2), -1)}, OUT.format("63, -1, 2", 1), "0..63"),
+    # It would wrap in uint8.
+    ({"coords": _set(BATCHED, (2, 1), 256)}, OUT.format("256, 63, 63", 2), "0..63"),
+    ({"coords": _set(COORDS, 2, COORDS[0])}, "(0, 0, 0) occurs twice, in rows 0 and 2", "once"),
+    ({"feats": _set(FEATS, (0, 0), -np.inf)}, "feats is -inf in row 0", "finite"),
+    (
         {"feats": _set(FEATS.astype(np.float64), (2, 7), 1e300)},
         "feats is 1e+300 in row 2, channel 7",
         "float32",
     ),
-    "too many rows": (
-        {"coords": np.zeros((262145, 3), np.uint8)},
-        "shape (262145, 3)",
-        "N <= 262144",
-    ),
-}
+    ({"coords": np.zeros((262145, 3), np.uint8)}, "shape (262145, 3)", "N <= 262144"),
+]
 
 
-@pytest.mark.parametrize("form", ["npz", "hdf5", "group"])
-@pytest.mark.parametrize("fault", BAD_ARRAYS)
-def test_bad_arrays(make_pair, fault, form):
-    arrays, what, expected = BAD_ARRAYS[fault]
+@pytest.mark.parametrize(("arrays", "what", "expected"), BAD_ARRAYS, ids=lambda one: str(one)[:25])
+def test_bad_arrays(make_pair, arrays, what, expected):
     arrays = {"coords": COORDS, "feats": FEATS, **arrays}
     pair = make_pair(**arrays)
-    if form != "npz":
-        pair = hdf5_pair(pair, "a" if form == "group" else "", **arrays)
-    with pytest.raises(InputError) as caught:
-        read_latents(pair)
-    assert caught.value.path.startswith(str(pair.slat))
-    assert what in caught.value.fault
-    assert expected in caught.value.expected
+    for one in (pair, hdf5_pair(pair, **arrays), hdf5_pair(pair, "a", **arrays)):
+        with pytest.raises(InputError) as caught:
+            read_latents(one)
+        assert caught.value.path.startswith(str(one.slat))
+        assert what in caught.value.fault
+        assert expected in caught.value.expected
 
 
-@pytest.mark.parametrize("missing", ["coords", "feats"])
-def test_missing_array(make_pair, missing):
+def test_missing_array_and_group(make_pair):
     pair = make_pair()
-    arrays = {"coords": COORDS, "feats": FEATS}
-    del arrays[missing]
-    np.savez(pair.slat, **arrays)
-    with pytest.raises(InputError, match=f"0 arrays named '{missing}'"):
-        read_latents(pair)
-    with pytest.raises(InputError, match=f"has no dataset '{missing}'"):
-        read_latents(hdf5_pair(pair, **arrays))
-
-
-def test_missing_group(make_pair):
-    pair = hdf5_pair(make_pair(), "a", coords=COORDS, feats=FEATS)
+    for missing, arrays in (("feats", {"coords": COORDS}), ("coords", {"feats": FEATS})):
+        np.savez(pair.slat, **arrays)
+        with pytest.raises(InputError, match=f"0 arrays named '{missing}'"):
+            read_latents(pair)
+        with pytest.raises(InputError, match=f"has no dataset '{missing}'"):
+            read_latents(hdf5_pair(pair, missing, **arrays))
     with pytest.raises(InputError, match="has no group 'b'"):
-        read_latents(replace(pair, slat_group="b"))
+        read_latents(replace(hdf5_pair(pair), slat_group="b"))
 
 
 def test_npz_that_wants_pickle_is_refused(make_pair):
@@ -194,62 +162,29 @@ def test_npz_that_wants_pickle_is_refused(make_pair):
         read_latents(pair)
 
 
-def _soft(file, folder):
-    file["elsewhere"] = FEATS
-    file["feats"] = h5py.SoftLink("/elsewhere")
-
-
-def _external_link(file, folder):
-    file["feats"] = h5py.ExternalLink(str(folder / "secret.h5"), "feats")
-
-
-def _external_storage(file, folder):
-    file.create_dataset("feats", (3, 8), np.float32, external=[(str(folder / "secret.bin"), 0, 96)])
-
-
-def _virtual(file, folder):
-    layout = h5py.VirtualLayout((3, 8), np.float32)
-    layout[:] = h5py.VirtualSource(str(folder / "secret.h5"), "feats", (3, 8))
-    file.create_virtual_dataset("feats", layout)
-
-
-@pytest.mark.parametrize(
-    ("point", "fault"),
-    [
-        (_soft, "soft or external link"),
-        (_external_link, "soft or external link"),
-        (_external_storage, "keeps its values in another file"),
-        (_virtual, "virtual dataset"),
-    ],
-)
-def test_hdf5_that_points_elsewhere_is_refused(make_pair, tmp_path, point, fault):
-    with h5py.File(tmp_path / "secret.h5", "w") as secret:
-        secret["feats"] = FEATS
-    (tmp_path / "secret.bin").write_bytes(FEATS.tobytes())
-    pair = hdf5_pair(make_pair(), coords=COORDS)
-    with h5py.File(pair.slat, "a") as file:
-        point(file, tmp_path)
-    with pytest.raises(InputError, match=fault):
-        read_latents(pair)
-
-
-def test_hdf5_that_was_never_filled_is_refused(make_pair):
-    # HDF5 would read zeros, which are latents as good as any.
-    for number, chunks in enumerate([None, (2, 8)]):
-        pair = hdf5_pair(
-            make_pair(),
-            f"g{number}",
-            coords=COORDS,
-            feats={"shape": (3, 8), "dtype": np.float32, "chunks": chunks},
-        )
-        with pytest.raises(InputError, match=r"holds 0 of 96 bytes|its 0 chunks are not the 2"):
+def test_hdf5_whose_values_lie_elsewhere_or_nowhere_is_refused(make_pair, tmp_path):
+    secret, raw = str(tmp_path / "secret.h5"), tmp_path / "secret.bin"
+    with h5py.File(secret, "w") as file:
+        file["feats"] = FEATS
+    raw.write_bytes(FEATS.tobytes())
+    virtual = h5py.VirtualLayout((3, 8), np.float32)
+    virtual[:] = h5py.VirtualSource(secret, "feats", (3, 8))
+    empty = {"shape": (3, 8), "dtype": np.float32}
+    for number, (feats, fault) in enumerate(
+        [
+            (h5py.SoftLink("/0/coords"), "soft or external link"),
+            (h5py.ExternalLink(secret, "feats"), "soft or external link"),
+            (empty | {"external": [(str(raw), 0, 96)]}, "keeps its values in another file"),
+            (virtual, "virtual dataset"),
+            # HDF5 would read zeros, which are latents as good as any.
+            (empty, "holds 0 of 96 bytes"),
+            (empty | {"chunks": (2, 8)}, "its 0 chunks are not the 2"),
+            ({"data": FEATS, "compression": "lzf"}, r"uses HDF5 filters \[32000\].*h5repack"),
+        ]
+    ):
+        pair = hdf5_pair(make_pair(), str(number), coords=COORDS, feats=feats)
+        with pytest.raises(InputError, match=rf"\[{number}/feats\]: .*{fault}"):
             read_latents(pair)
-
-
-def test_hdf5_filters_that_are_not_known_are_refused(make_pair):
-    pair = hdf5_pair(make_pair(), coords=COORDS, feats={"data": FEATS, "compression": "lzf"})
-    with pytest.raises(InputError, match=r"\[feats\]: uses HDF5 filters \[32000\].*h5repack"):
-        read_latents(pair)
 
 
 def test_hdf5_chunk_that_fails_its_checksum_is_refused(make_pair):
