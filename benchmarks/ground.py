@@ -43,8 +43,7 @@ from slatprep.demo import nerf
 from slatprep.demo.asset import make_asset
 from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.difficulty import LEVELS
-from slatprep.demo.materials import draw
-from slatprep.demo.model import Model, Parts, Rng, orient
+from slatprep.demo.model import Model, Parts, Rng, draw, orient
 from slatprep.demo.shapes import Shape, box, capsule, cone, cylinder, ellipsoid
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform, voxel_centres

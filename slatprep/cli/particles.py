@@ -233,19 +233,23 @@ def simulate(
         gaussians,
         axes,
         particles,
-        work.Override(material, young, density),
+        material,
+        young,
+        density,
     )
     for note in scene.notes:
         output.note(note)
-    begin, how = time.perf_counter(), work.Motion(**vars(motion))
+    begin = time.perf_counter()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", UserWarning)
-        moved = work.run(scene, how)
+        moved = work.run(scene, **vars(motion))
     for warning in told:
         output.note(str(warning.message))
     computed = time.perf_counter() - begin
     with output.progress("simulate") as progress:
-        count = work.write_frames(Path(out), scene, moved, how, picture, stretch, progress=progress)
+        count = work.write_frames(
+            Path(out), scene, moved, motion.rate, picture, stretch, progress=progress
+        )
     counts = {
         "particles": len(scene.positions),
         "gaussians": len(scene.vertices),

@@ -1,8 +1,8 @@
 """Demo data: procedural assets with exactly known truth, in the layouts of real ones.
 
-`shapes` and `materials` define parts, and `catalogue` the objects; `voxelise`, `difficulty`,
-`generated` and `nerf` make both sides of an object; `asset` adds the truth; `write` and `sources`
-write the files.
+`shapes` and `model` define parts and materials, and `catalogue` the objects; `voxelise`,
+`difficulty`, `generated` and `nerf` make both sides of an object; `asset` adds the truth; `write`
+and `sources` write the files.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,14 @@ from slatprep.demo import write
 from slatprep.demo.asset import DemoAsset, make_asset
 from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
 from slatprep.demo.latents import GRIDS, Encoder, LatentKind
-from slatprep.demo.sources import ONE_FRAME, TABLE, Source, classes_of, write_description
+from slatprep.demo.sources import (
+    ONE_FRAME,
+    TABLE,
+    Source,
+    classes_of,
+    write_description,
+    write_json,
+)
 from slatprep.errors import ConfigError
 from slatprep.workers.local import run_unordered
 
@@ -152,7 +160,7 @@ def make_demo(
             progress(len(made), assets)
     entries = [made[index] for index in range(assets)]
     _write_definition(root, recipe, entries)
-    _write_json(root / "demo.json", {"recipe": asdict(recipe), "assets": entries})
+    write_json(root / "demo.json", {"recipe": asdict(recipe), "assets": entries})
     return DemoSummary(
         directory=root,
         config=root / "dataset.toml",
@@ -164,80 +172,69 @@ def make_demo(
 
 
 def _check(recipe: _Recipe) -> None:
-    for name, value, allowed in (
-        ("assets", recipe.assets, recipe.assets >= 1),
-        ("seed", recipe.seed, recipe.seed >= 0),
-        ("views", recipe.views, recipe.views >= 1),
-        ("samples", recipe.samples, recipe.samples >= 1),
-        ("habitual_share", recipe.habitual_share, 0.0 <= recipe.habitual_share <= 1.0),
-        ("levels", recipe.levels, recipe.levels and set(recipe.levels) <= set(LEVELS)),
-    ):
+    for name, allowed in {
+        "assets": recipe.assets >= 1,
+        "seed": recipe.seed >= 0,
+        "views": recipe.views >= 1,
+        "samples": recipe.samples >= 1,
+        "habitual_share": 0.0 <= recipe.habitual_share <= 1.0,
+        "levels": recipe.levels and set(recipe.levels) <= set(LEVELS),
+    }.items():
         if not allowed:
             raise ConfigError(
-                f"{name} = {value!r} makes no demo: assets, views and samples are at least 1, seed "
-                f"at least 0, habitual_share in 0..1, levels some of {', '.join(map(str, LEVELS))}"
+                f"{name} = {getattr(recipe, name)!r} makes no demo: assets, views and samples are "
+                "at least 1, seed at least 0, habitual_share in 0..1, levels some of "
+                + ", ".join(map(str, LEVELS))
             )
-    if recipe.source in ONE_FRAME and (set(recipe.levels) != {0} or recipe.views > 1):
-        raise ConfigError(
-            f"source {recipe.source!r} is made of the mesh that its SLAT was encoded from: level 0 "
-            "alone, and 1 view"
-        )
-    npz_alone = recipe.slat_form == "npz" and recipe.views == 1
-    if recipe.encoder.startswith("trellis2") and not npz_alone:
-        raise ConfigError(
-            f"encoder {recipe.encoder!r} has an npz an object: slat_form 'npz', and 1 view"
-        )
-    if recipe.samples > 1 and recipe.source != "pixieverse":
-        raise ConfigError("several samples are grids: source 'pixieverse', or 1 sample")
-    if recipe.slat_form == "hdf5-groups" and recipe.views > 1:
-        raise ConfigError("slat_form 'hdf5-groups' holds one view an object: use 'hdf5', or 1 view")
+    several, why = recipe.views > 1, ""
+    if recipe.source in ONE_FRAME and (set(recipe.levels) != {0} or several):
+        why = f"source {recipe.source!r} is made of the mesh that its SLAT was encoded from: level "
+        why += "0 alone, and 1 view"
+    elif recipe.encoder.startswith("trellis2") and (recipe.slat_form != "npz" or several):
+        why = f"encoder {recipe.encoder!r} has an npz an object: slat_form 'npz', and 1 view"
+    elif recipe.samples > 1 and recipe.source != "pixieverse":
+        why = "several samples are grids: source 'pixieverse', or 1 sample"
+    elif recipe.slat_form == "hdf5-groups" and several:
+        why = "slat_form 'hdf5-groups' holds one view an object: use 'hdf5', or 1 view"
+    if why:
+        raise ConfigError(why)
 
 
 def _claim(root: Path, recipe: _Recipe) -> None:
     """Take a directory that is new, empty, or holds the same demo, and mark it."""
-    mark = root / "demo.json"
+    mark, found = root / "demo.json", None
     plain = json.loads(json.dumps(asdict(recipe)))
     if root.exists() and any(root.iterdir()):
-        if _recipe_in(mark) != plain:
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            found = json.loads(mark.read_text("utf-8"))["recipe"]
+        if found != plain:
             raise ConfigError(
                 f"{root} holds something else than this demo: choose an empty directory"
             )
     else:
         root.mkdir(parents=True, exist_ok=True)
-        _write_json(mark, {"recipe": plain, "assets": []})
+        write_json(mark, {"recipe": plain, "assets": []})
     (root / "slat" / "latents.h5").unlink(missing_ok=True)  # this one is added to
-
-
-def _recipe_in(mark: Path) -> object:
-    """Return the recipe that marks a directory; None without a mark."""
-    try:
-        return json.loads(mark.read_text("utf-8"))["recipe"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, Any]]:
     """Make and write an asset; return its number and its entry in the definition."""
     channels, resolution = GRIDS[recipe.encoder]
-    names = ("levels", "views", "latents", "habitual_share")
-    own = {name: getattr(recipe, name) for name in names} | {
-        "one_frame": recipe.source in ONE_FRAME
-    }
-    asset = make_asset(recipe.seed, index, channels=channels, resolution=resolution, **own)
-    write.write_annotated(root / recipe.adapter, asset, recipe.source, resolution)
-    if recipe.samples > 1:
-        grids = write.sample_grids(recipe.seed, index, asset, recipe.samples)
-        write.write_samples(root / recipe.adapter, asset, grids)
+    asset = make_asset(
+        recipe.seed, index, levels=recipe.levels, views=recipe.views, latents=recipe.latents,
+        habitual_share=recipe.habitual_share, channels=channels, resolution=resolution,
+        one_frame=recipe.source in ONE_FRAME,
+    )  # fmt: skip
+    several = recipe.samples > 1
+    grids = write.sample_grids(recipe.seed, index, asset, recipe.samples) if several else None
+    write.write_annotated(root / recipe.adapter, asset, recipe.source, resolution, grids)
     if recipe.results:
         write.write_results(root / "results", asset)
     write.write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names, recipe.encoder)
     write.write_truth(root / "truth", asset, recipe.source)
     return index, {
         "id": asset.object_id,
-        "name": asset.name,
-        "category": asset.category,
-        "level": asset.level,
-        "symmetric": asset.symmetric,
+        **{name: getattr(asset, name) for name in ("name", "category", "level", "symmetric")},
         "slat": write.slat_name(asset, recipe.slat_names),
         "rows": [
             {
@@ -251,39 +248,43 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
 
 
 def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]) -> None:
-    categories = ((entry["id"], entry["category"]) for entry in entries)
-    write.write_categories(root / "obj_ids_metadata.json", categories)
+    """Write the dataset's definition, and what it names beside the sources."""
     slat_root = "slat/latents.h5" if recipe.slat_form == "hdf5-groups" else "slat"
-    lines = [
-        "# A demo dataset; roots are relative to this file.",
-        f'name = "demo-{recipe.seed}"',
-        "",
-        "[pixieverse]",
-        f'root = "{recipe.adapter}"',
-    ]
+    fields, slat = {"root": recipe.adapter}, {"root": slat_root}
+    pairing = {"categories": "obj_ids_metadata.json"}
     if recipe.samples > 1:
-        lines.append('samples = "merge"')
+        fields["samples"] = "merge"
     if recipe.adapter != "pixieverse":
-        lines.append(f'adapter = "{recipe.adapter}"')
-    lines += ["", "[slat]", f'root = "{slat_root}"']
+        fields["adapter"] = recipe.adapter
+    if recipe.adapter == "voxels":
+        write_description(root / "voxels", TABLE, classes_of(recipe.source))
     if recipe.encoder in ("plain", "plain-128"):
         channels, resolution = GRIDS[recipe.encoder]
         space = {"encoder": recipe.encoder, "channels": channels, "resolution": resolution}
-        _write_json(root / "encoder.json", space)
-        lines.append('encoder = "encoder.json"')
+        write_json(root / "encoder.json", space)
+        slat["encoder"] = "encoder.json"
     elif recipe.encoder != "trellis":
-        lines.append(f'encoder = "{recipe.encoder}"')
-    if recipe.adapter == "voxels":
-        write_description(root / "voxels", TABLE, classes_of(recipe.source))
-    if recipe.source in ONE_FRAME:
-        lines += ["", "[align]", 'engine = "known"']
-    lines += ["", "[pairing]", 'categories = "obj_ids_metadata.json"']
+        slat["encoder"] = recipe.encoder
+    classes = {
+        entry["id"]: {"obj_class": entry["category"], "vlm_filtering": {"is_appropriate": True}}
+        for entry in entries
+    }
+    write_json(root / pairing["categories"], classes)
     if recipe.slat_names == "sha256":
-        rows = ((e["slat"], e["id"], e["rows"][0]["voxels"]) for e in entries)
-        write.write_trellis_metadata(root / "metadata.csv", rows)
-        lines.append('map = "metadata.csv"')
-    (root / "dataset.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        pairing["map"] = "metadata.csv"
+        lines = ["sha256,file_identifier,aesthetic_score,num_voxels"]
+        for entry in entries:
+            url = f"https://sketchfab.com/3d-models/{entry['id']}"
+            lines.append(f"{entry['slat']},{url},6.0,{entry['rows'][0]['voxels']}")
+        _write_lines(root / pairing["map"], lines)
+    align = {"engine": "known"} if recipe.source in ONE_FRAME else {}
+    sections = {"pixieverse": fields, "slat": slat, "align": align, "pairing": pairing}
+    lines = ["# A demo dataset; roots are relative to this file.", f'name = "demo-{recipe.seed}"']
+    for name, values in sections.items():
+        if values:
+            lines += ["", f"[{name}]", *(f'{key} = "{value}"' for key, value in values.items())]
+    _write_lines(root / "dataset.toml", lines)
 
 
-def _write_json(path: Path, value: object) -> None:
-    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+def _write_lines(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

@@ -10,18 +10,15 @@ from numpy.typing import NDArray
 
 from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.difficulty import (
-    EMPTY,
     LEVELS,
     QUARTER_TURNS,
     SAME_SHAPE_LEVELS,
-    UNLABELLED,
     Frames,
-    damage,
     draw_frames,
     generate,
 )
 from slatprep.demo.latents import LatentKind, make_latents
-from slatprep.demo.nerf import nerf_field
+from slatprep.demo.nerf import EMPTY, UNLABELLED, damage, nerf_field
 from slatprep.demo.shapes import Solid
 from slatprep.demo.voxelise import voxelise
 from slatprep.geometry.frames import nearest_similarity, voxel_centres
@@ -31,6 +28,9 @@ from slatprep.records import BACKGROUND, RESOLUTION
 # Each random choice has a stream of its own, so that one option of the demo
 # does not change what another one draws.
 _SHAPE, _FRAME, _DAMAGE, _LATENTS, _HABIT, _GENERATED = range(6)
+
+# A quarter turn about z, from one view to the next.
+_QUARTER = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 # Distances to bent shapes are known less tightly and are needed over a longer range.
 _GENERATED_REACH = 0.12
@@ -154,10 +154,11 @@ def make_asset(
         stuff = damage(rng, stuff, frames.pixieverse_distance(solid), len(solid.stuffs))
     made = []
     for v in range(views):
-        seen = replace(frames, slat=replace(frames.slat, rotation=_heading(v)))
+        heading = np.linalg.matrix_power(_QUARTER, v).astype(np.float64)
+        seen = replace(frames, slat=replace(frames.slat, rotation=heading))
         if difficulty.generated:
             rng = np.random.default_rng([seed, index, _GENERATED, v])
-            seen = generate(rng, seen, difficulty, solid, skin)
+            seen = generate(rng, seen, difficulty.bend, solid, skin)
         rng = np.random.default_rng([seed, index, _LATENTS, v])
         name = f"view_{v}" if views > 1 else ""
         view = _slat_side(rng, name, solid, seen, latents, channels, resolution)
@@ -172,12 +173,6 @@ def make_asset(
         stuff != EMPTY,
         tuple(made),
     )
-
-
-def _heading(view: int) -> NDArray[np.float64]:
-    """Return the quarter turn about z of a view."""
-    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[view % 4]
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=np.float64)
 
 
 def _pixieverse_side(solid: Solid, frames: Frames) -> NDArray[np.int16]:

@@ -23,29 +23,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.demo.generated import Distortion, Warp, draw_distortion
 from slatprep.demo.model import Array, Rng, direction
 from slatprep.demo.shapes import Solid, bounding_box
-from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform, voxel_centres
-from slatprep.geometry.voxels import boundary
-from slatprep.records import RESOLUTION
+from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform
 
 # Slightly smaller than the cube, so that no surface lies exactly on its faces.
 _FULL = 1.0 - 1e-4
-
-EMPTY, UNLABELLED = -1, -2
-"""Stuff of an empty voxel, and of one that is occupied but has no label."""
 
 
 @dataclass(frozen=True)
 class Difficulty:
     """The settings of a level: angles in degrees, lengths in voxels, scale as a share.
 
-    ``proportions`` and ``bend`` are for a generated shape, see
-    `slatprep.demo.generated.draw_distortion`; ``room`` is the margin for a NeRF's field on each
-    side of the grid.
+    ``bend`` is for a generated shape, see `slatprep.demo.generated.draw_distortion`; ``room`` is
+    the margin for a NeRF's field on each side of the grid.
     """
 
     tilt: float = 0.0
@@ -55,7 +48,6 @@ class Difficulty:
     damaged: bool = False
     warp: float = 0.0
     own_boxes: bool = False
-    proportions: tuple[float, float] = (0.0, 0.0)
     bend: float = 0.0
     nerf: bool = False
     room: float = 0.0
@@ -77,13 +69,9 @@ LEVELS: dict[int, Difficulty] = {
     2: Difficulty(tilt=15.0, shift=1.5, scale=(0.02, 0.10), damaged=True),
     3: Difficulty(any_rotation=True, damaged=True),
     4: Difficulty(tilt=15.0, shift=1.5, warp=1.0),
-    5: Difficulty(
-        tilt=15.0, shift=1.5, own_boxes=True, damaged=True, proportions=(0.10, 0.25), bend=2.0
-    ),
+    5: Difficulty(tilt=15.0, shift=1.5, own_boxes=True, damaged=True, bend=2.0),
     6: Difficulty(tilt=15.0, shift=1.5, own_boxes=True, nerf=True, room=2.0),
-    7: Difficulty(
-        any_rotation=True, own_boxes=True, proportions=(0.10, 0.25), bend=2.0, nerf=True, room=2.0
-    ),
+    7: Difficulty(any_rotation=True, own_boxes=True, bend=2.0, nerf=True, room=2.0),
 }
 
 SAME_SHAPE_LEVELS = (0, 1, 2, 3, 4)
@@ -101,11 +89,6 @@ class Pose:
     scale: float
     centre: Array
     shift: Array
-
-    def matrix(self) -> Array:
-        """Return the pose as a 4x4 transform, object to frame."""
-        shift = self.shift - self.scale * self.rotation @ self.centre
-        return make_transform(self.rotation, shift, self.scale)
 
     def to_object(self, points: Array) -> Array:
         """Map points (P, 3) of the frame to the object."""
@@ -189,13 +172,14 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
     return Frames(Pose(rotation, scale, centre, shift), slat, warp)
 
 
-def generate(rng: Rng, frames: Frames, difficulty: Difficulty, solid: Solid, skin: Array) -> Frames:
+def generate(rng: Rng, frames: Frames, bend: float, solid: Solid, skin: Array) -> Frames:
     """Replace the SLAT side of an asset by a generated shape that fills the cube.
 
-    `frames` has no warp; the rotation of its SLAT side stays, and its pose is fitted to the shape.
-    `skin` (K, 3) are points on the object's surface, at most a voxel apart.
+    `bend` is as `draw_distortion` takes it. `frames` has no warp; the rotation of its SLAT side
+    stays, and its pose is fitted to the shape. `skin` (K, 3) are points on the object's surface, at
+    most a voxel apart.
     """
-    distortion = draw_distortion(rng, solid.extent, difficulty.proportions, difficulty.bend)
+    distortion = draw_distortion(rng, solid.extent, bend)
     turned = distortion.inverse(skin) @ frames.slat.rotation.T
     low, high = turned.min(axis=0), turned.max(axis=0)
     # Between these points the surface may extend a voxel farther.
@@ -223,29 +207,3 @@ def _any_rotation(rng: Rng) -> Array:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def damage(
-    rng: Rng, stuff: NDArray[np.int16], distance: Callable[[Array], Array], stuffs: int
-) -> NDArray[np.int16]:
-    """Remove pieces of a grid (64, 64, 64) and add floaters, as in the density of a NeRF.
-
-    Entries of `stuff` are indices, `EMPTY` where empty; one floater is `UNLABELLED`. `distance` is
-    a bound of the solid in the grid's frame. Floaters get one of `stuffs` stuffs.
-    """
-    damaged = stuff.copy()
-    index = np.argwhere(np.ones(stuff.shape, dtype=bool))
-    skin = np.argwhere(boundary(stuff >= 0))
-    for _ in range(rng.integers(1, 4)):
-        centre, radius = skin[rng.integers(len(skin))], rng.uniform(2.5, 5.0)
-        damaged[tuple(index[((index - centre) ** 2).sum(axis=1) < radius**2].T)] = EMPTY
-
-    wanted = int(rng.integers(2, 5))
-    places = rng.integers(3, RESOLUTION - 3, (200, 3))
-    free = places[distance(voxel_centres(places)) > 4.5 * VOXEL_SIZE][:wanted]
-    for k, centre in enumerate(free):
-        radii = rng.uniform(1.0, 2.5, 3)
-        blob = index[(((index - centre) / radii) ** 2).sum(axis=1) < 1.0]
-        empty = blob[damaged[tuple(blob.T)] == EMPTY]
-        damaged[tuple(empty.T)] = UNLABELLED if k == 0 else rng.integers(stuffs)
-    return damaged

@@ -21,6 +21,9 @@ _LARGEST_SLOPE = 0.7
 _REACH = 0.75
 """Half edge of the cube in which bends are bounded, in sizes of the object; all shapes fit."""
 
+_WRONG = 0.10, 0.25
+"""Least and greatest error of the proportions, along one axis, as a share."""
+
 _EDGE = 4.0
 """Rate at which a bend grows from the seen to the unseen side, per size of the object."""
 
@@ -151,25 +154,20 @@ def _slope(waves: Warp, away: Array) -> float:
     slopes = ripple.reshape(-1, 3, 3) + rise[:, None, None] * moved[:, :, None] * away
     size, turn = waves.sizes
     # The growth is at most 4/3, its derivative _EDGE / 3, its second one 0.77 _EDGE^2 / 3.
-    second = float(
-        4.0 / 3.0 * size @ turn**2 + 2.0 * _EDGE / 3.0 * size @ turn + 0.26 * _EDGE**2 * size.sum()
-    )
-    half_diagonal = float(np.sqrt(3.0)) * _REACH / (steps - 1)
-    steepest = float(np.linalg.norm(slopes, 2, axis=(1, 2)).max())
-    return steepest + second * half_diagonal
+    second = 4.0 / 3.0 * size @ turn**2 + 2.0 * _EDGE / 3.0 * size @ turn
+    second += 0.26 * _EDGE**2 * size.sum()
+    half_diagonal = np.sqrt(3.0) * _REACH / (steps - 1)
+    return float(np.linalg.norm(slopes, 2, axis=(1, 2)).max() + second * half_diagonal)
 
 
-def draw_distortion(
-    rng: Rng, extent: Array, proportions: tuple[float, float], bend: float
-) -> Distortion:
+def draw_distortion(rng: Rng, extent: Array, bend: float) -> Distortion:
     """Draw the distortion of a generated shape, without folds.
 
-    `extent` (2, 3) is the object's bounding box, `proportions` the least and greatest error along
-    an axis as a share. `bend` is the root mean square of the smooth part, in voxels of a grid that
-    the object fills.
+    `extent` (2, 3) is the object's bounding box. `bend` is the root mean square of the smooth part,
+    in voxels of a grid that the object fills.
     """
     stretch = np.ones(3)
-    stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*proportions)
+    stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*_WRONG)
     waves = Warp.draw(rng, bend, (0.6, 1.1))
     # The image is taken from somewhere around the object, a little above it or below.
     angle, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.3, 0.5)

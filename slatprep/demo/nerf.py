@@ -1,19 +1,25 @@
-"""The density of a NeRF of an object, on PixieVerse's grid.
+"""What the density of a NeRF does to an object on PixieVerse's grid.
 
-The field is thicker than the object and rough, with hollows inside and floating blobs. Some thin
-parts are missing, and some fields include a piece of the ground.
+A grid is damaged, or all of it replaced by a field that is thicker than the object and rough, with
+hollows inside and floating blobs. Some thin parts of that are missing, and some fields include a
+piece of the ground.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from slatprep.demo.difficulty import UNLABELLED
 from slatprep.demo.model import Rng
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
+from slatprep.geometry.voxels import boundary
 from slatprep.records import RESOLUTION
+
+EMPTY, UNLABELLED = -1, -2
+"""Stuff of an empty voxel, and of one that is occupied but has no label."""
 
 THICKENING = 0.5
 """Distance [voxel] of the surface outside that of the exact grid.
@@ -32,10 +38,34 @@ _THIN = 1.5  # Half the thickness [voxel] below which a part may be lost.
 _MOST_LOST = 0.15  # Largest share of an object to lose with its thin parts.
 
 
+def damage(
+    rng: Rng,
+    stuff: NDArray[np.int16],
+    distance: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    stuffs: int,
+) -> NDArray[np.int16]:
+    """Remove pieces of a grid (64, 64, 64) of stuff indices, and add two to four floaters.
+
+    `distance` is a bound of the solid in the grid's frame. Floaters get one of `stuffs` stuffs; one
+    of them is `UNLABELLED`.
+    """
+    damaged = stuff.copy()
+    skin = np.argwhere(boundary(stuff >= 0))
+    for _ in range(rng.integers(1, 4)):
+        centre = skin[rng.integers(len(skin))]
+        damaged[_ball(centre, np.full(3, rng.uniform(2.5, 5.0)))] = EMPTY
+    wanted = int(rng.integers(2, 5))
+    places = rng.integers(3, RESOLUTION - 3, (200, 3))
+    free = places[distance(voxel_centres(places)) > 4.5 * VOXEL_SIZE][:wanted]
+    for k, centre in enumerate(free):
+        _add_blob(rng, damaged, _ball(centre, rng.uniform(1.0, 2.5, 3)), stuffs, k > 0)
+    return damaged
+
+
 def nerf_field(
     rng: Rng, stuff: NDArray[np.int16], up: NDArray[np.float64], stuffs: int
 ) -> NDArray[np.int16]:
-    """Degrade an exact grid (64, 64, 64) of stuff indices, -1 if empty, as a NeRF's density would.
+    """Degrade an exact grid (64, 64, 64) of stuff indices as a NeRF's density would.
 
     The unit vector `up` (3,) points up from the ground. Blobs and ground get one of `stuffs`
     stuffs; the voxels of one blob are `UNLABELLED`.
@@ -45,7 +75,7 @@ def nerf_field(
     depth = ndimage.distance_transform_edt(kept)
     signed = np.where(kept, 0.5 - depth, away - 0.5)
     rough = ROUGHNESS * np.clip(_smooth_noise(rng, 1.5), -_MOST_ROUGH, _MOST_ROUGH)
-    field = np.where(signed <= THICKENING + rough, stuff[tuple(nearest)], np.int16(-1))
+    field = np.where(signed <= THICKENING + rough, stuff[tuple(nearest)], np.int16(EMPTY))
     _hollow(rng, field, depth)
     if rng.uniform() < GROUND_SHARE:
         _add_ground(rng, field, kept, up, int(rng.integers(stuffs)))
@@ -83,7 +113,7 @@ def _hollow(rng: Rng, field: NDArray[np.int16], depth: NDArray[np.float64]) -> N
     deep = np.argwhere(depth > 3.5)
     for _ in range(rng.integers(1, 4) if len(deep) else 0):
         hollow = _ball(deep[rng.integers(len(deep))], rng.uniform(2.0, 6.0, 3))
-        field[hollow & (depth > 2.0)] = -1
+        field[hollow & (depth > 2.0)] = EMPTY
 
 
 def _add_ground(
@@ -104,12 +134,18 @@ def _add_ground(
     radius = rng.uniform(0.9, 1.4) * float(np.quantile(distance[occupied], 0.95))
     top, thickness = foot + rng.uniform(0.0, 1.5), rng.uniform(2.0, 4.0)
     slab = (height <= top) & (height > top - thickness) & (distance < radius)
-    field[slab & (field == -1)] = stuff
+    field[slab & (field == EMPTY)] = stuff
 
 
 def _add_blobs(rng: Rng, field: NDArray[np.int16], away: NDArray[np.float64], stuffs: int) -> None:
     """Add blobs in empty space, one of them without a label."""
-    free = np.argwhere((away > 4.5) & (field == -1))
+    free = np.argwhere((away > 4.5) & (field == EMPTY))
     for k in range(rng.integers(3, 8) if len(free) else 0):
         blob = _ball(free[rng.integers(len(free))], rng.uniform(1.0, 3.0, 3))
-        field[blob & (field == -1)] = UNLABELLED if k == 0 else rng.integers(stuffs)
+        _add_blob(rng, field, blob, stuffs, k > 0)
+
+
+def _add_blob(
+    rng: Rng, field: NDArray[np.int16], blob: NDArray[np.bool_], stuffs: int, labelled: bool
+) -> None:
+    field[blob & (field == EMPTY)] = rng.integers(stuffs) if labelled else UNLABELLED

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,10 +32,6 @@ class Shape:
 
     distance: Region
     support: Callable[[Points], float]
-
-    def box(self) -> NDArray[np.float64]:
-        """Return the bounding box as (2, 3): lower and upper corner."""
-        return bounding_box([self], np.eye(3))
 
 
 def bounding_box(shapes: Sequence[Shape], rotation: Points) -> NDArray[np.float64]:
@@ -178,8 +175,7 @@ def half_space(point: ArrayLike, normal: ArrayLike) -> Region:
     return lambda p: -((p - q) @ n)
 
 
-@dataclass(frozen=True)
-class Stuff:
+class Stuff(NamedTuple):
     """The material of a part: class 0..6, and properties in Pa, kg/m^3 and 1."""
 
     material: int
@@ -211,7 +207,7 @@ class Solid:
         # A part is evaluated only near its own box. Elsewhere its distance is at least this,
         # and the voxelisation needs no more.
         self.reach = reach * float((self.extent[1] - self.extent[0]).max())
-        self._boxes = [shape.box() for shape in self.shapes]
+        self._boxes = [bounding_box([shape], np.eye(3)) for shape in self.shapes]
         self.stuffs: list[Stuff] = []
         self._first_stuff: list[int] = []
         for part in self.parts:
@@ -246,17 +242,12 @@ class Solid:
             raise ValueError("a point too far from the solid has no part")
         stuff = np.array(self._first_stuff)[owner]
         for k, part in enumerate(self.parts):
-            if part.coats:
+            for coat, (region, _) in enumerate(part.coats, self._first_stuff[k] + 1):
                 mine = np.flatnonzero(owner == k)
-                for c, (region, _) in enumerate(part.coats):
-                    painted = mine[region(points[mine]) < 0]
-                    stuff[painted] = self._first_stuff[k] + 1 + c
+                stuff[mine[region(points[mine]) < 0]] = coat
         return stuff
 
     def table(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Return class (S,) uint8 and Young's modulus, density, Poisson's ratio (S, 3) float32."""
-        material = np.array([s.material for s in self.stuffs], dtype=np.uint8)
-        properties = np.array(
-            [(s.youngs_modulus, s.density, s.poissons_ratio) for s in self.stuffs], dtype=np.float32
-        )
-        return material, properties
+        rows = np.array(self.stuffs)
+        return rows[:, 0].astype(np.uint8), rows[:, 1:].astype(np.float32)

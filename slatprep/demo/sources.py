@@ -156,8 +156,21 @@ def write_description(
     """Write ``source.json`` of plain voxels, with names for its classes or without classes."""
     root.mkdir(parents=True, exist_ok=True)
     about = {"properties": properties, "classes": classes or False, **others}
-    text = json.dumps(about, indent=1)
-    (root / "source.json").write_text(text + "\n", encoding="utf-8")
+    write_json(root / "source.json", about)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write JSON with a line for each value."""
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], below: str = "") -> None:
+    """Write arrays to a file of their own, or add them to a file `below` a group, ``name/``."""
+    import h5py
+
+    with h5py.File(path, "a" if below else "w") as file:
+        for key, array in arrays.items():
+            file.create_dataset(below + key, data=array, track_times=False)
 
 
 def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -169,20 +182,15 @@ def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[
     if form == "npz":
         np.savez(root / f"{name}.npz", allow_pickle=False, **dict(arrays))
     elif form == "hdf5":
-        import h5py
-
-        with h5py.File(root / f"{name}.h5", "w") as file:
-            for key, array in arrays.items():
-                file.create_dataset(key, data=array, track_times=False)
+        write_hdf5(root / f"{name}.h5", arrays)
     elif form == "zarr":
         import zarr
 
         group = zarr.open_group(root / f"{name}.zarr", mode="w", zarr_format=3)
+        # All chunks: one that is missing later is then known to be lost.
+        whole = {"write_empty_chunks": True}
         for key, array in arrays.items():
-            # All chunks: one that is missing later is then known to be lost.
-            group.create_array(
-                key, data=np.ascontiguousarray(array), config={"write_empty_chunks": True}
-            )
+            group.create_array(key, data=np.ascontiguousarray(array), config=whole)
     else:
         columns = {key: array for key, array in arrays.items() if key != "voxels"}
         points = ((arrays["voxels"] + 0.5) / 64.0 - 0.5).astype(np.float32)

@@ -17,7 +17,7 @@ from slatprep.records import RESOLUTION
 
 Distance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-_BLOCK = 4
+_BLOCK, _HALVINGS = 4, 3
 _HALF_DIAGONAL = 3.0**0.5 / 2.0
 _CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
@@ -38,23 +38,20 @@ def voxelise(
     near, inside = _near_voxels(distance, side)
     candidates = np.argwhere(near)
     met = _changes_sign(distance, candidates, inside)
-    open_ones = candidates[~met]
-    met[~met] = _subdivide(distance, open_ones, inside[tuple(open_ones.T)], side)
+    met[~met] = _subdivide(distance, candidates[~met], inside)
     surface = np.zeros_like(inside)
     surface[tuple(candidates[met].T)] = True
-    filled: NDArray[np.bool_] = surface | inside
-    return surface, filled
+    return surface, surface | inside
 
 
 def _near_voxels(distance: Distance, side: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the voxels that the surface may meet, and whether each voxel's centre is inside."""
     blocks = side // _BLOCK
     index = np.argwhere(np.ones((blocks,) * 3, dtype=bool))
-    at_blocks = distance((index + 0.5) / blocks - 0.5).reshape((blocks,) * 3)
-    block_near = np.abs(at_blocks) <= _HALF_DIAGONAL / blocks
+    at_blocks = distance(voxel_centres(index, blocks)).reshape((blocks,) * 3)
     ones = np.ones((_BLOCK,) * 3, dtype=bool)
     inside = np.kron(at_blocks <= 0, ones)
-    near = np.kron(block_near, ones)
+    near = np.kron(np.abs(at_blocks) <= _HALF_DIAGONAL / blocks, ones)
     voxels = np.argwhere(near)
     at_voxels = distance(voxel_centres(voxels, side))
     inside[tuple(voxels.T)] = at_voxels <= 0
@@ -66,36 +63,30 @@ def _changes_sign(
     distance: Distance, voxels: NDArray[np.intp], inside: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return whether a corner is on the other side of the surface than the voxel's centre."""
-    corners = voxels[:, None, :] + _CORNERS
+    corners = (voxels[:, None] + _CORNERS).reshape(-1, 3).T
     side = len(inside)
     lattice = np.zeros((side + 1,) * 3, dtype=bool)
-    lattice[tuple(corners.reshape(-1, 3).T)] = True
+    lattice[tuple(corners)] = True
     needed = np.argwhere(lattice)
-    points: NDArray[np.float64] = needed.astype(np.float64) / side - 0.5
-    lattice[tuple(needed.T)] = distance(points) <= 0
-    at_corners = lattice[tuple(np.moveaxis(corners, -1, 0))]
-    differs: NDArray[np.bool_] = at_corners != inside[tuple(voxels.T)][:, None]
-    return np.asarray(np.any(differs, axis=1))
+    lattice[tuple(needed.T)] = distance(needed / side - 0.5) <= 0
+    differs = lattice[tuple(corners)].reshape(-1, 8) != inside[tuple(voxels.T)][:, None]
+    return np.asarray(differs.any(axis=1))
 
 
 def _subdivide(
-    distance: Distance,
-    voxels: NDArray[np.intp],
-    inside: NDArray[np.bool_],
-    side: int,
-    depth: int = 3,
+    distance: Distance, voxels: NDArray[np.intp], inside: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return whether a cell centre of the halved cubes is on the other side of the surface."""
-    met = np.zeros(len(voxels), dtype=bool)
+    met, own = np.zeros(len(voxels), dtype=bool), inside[tuple(voxels.T)]
     owner = np.arange(len(voxels))
-    centres = voxel_centres(voxels, side)
-    edge = 1.0 / side
-    for _ in range(depth):
+    centres = voxel_centres(voxels, len(inside))
+    edge = 1.0 / len(inside)
+    for _ in range(_HALVINGS):
         edge /= 2.0
         centres = (centres[:, None, :] + (_CORNERS - 0.5) * edge).reshape(-1, 3)
         owner = np.repeat(owner, len(_CORNERS))
         value = distance(centres)
-        met[owner[(value <= 0) != inside[owner]]] = True
+        met[owner[(value <= 0) != own[owner]]] = True
         keep = (np.abs(value) <= _HALF_DIAGONAL * edge) & ~met[owner]
         centres, owner = centres[keep], owner[keep]
     return met

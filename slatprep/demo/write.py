@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 
 from slatprep.demo.asset import DemoAsset, DemoView
 from slatprep.demo.latents import GRIDS, Encoder
-from slatprep.demo.sources import Source, columns_of, write_field
+from slatprep.demo.sources import Source, columns_of, write_field, write_hdf5
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.records import BACKGROUND, RESOLUTION
@@ -41,19 +38,28 @@ def slat_name(asset: DemoAsset, names: SlatNames) -> str:
 
 
 def write_annotated(
-    root: Path, asset: DemoAsset, source: Source, resolution: int = RESOLUTION
+    root: Path,
+    asset: DemoAsset,
+    source: Source,
+    resolution: int = RESOLUTION,
+    samples: NDArray[np.float32] | None = None,
 ) -> None:
-    """Write the annotated side of an asset below `root`: a grid with mask and bounds, or voxels."""
-    if not source.startswith("pixie"):
+    """Write the annotated side of an asset below `root`: a grid with mask and bounds, or voxels.
+
+    Of PixieVerse it has the grids of `samples`, if there are any, in place of the asset's.
+    """
+    folder = root / asset.object_id
+    if source.startswith("pixie-"):
+        prediction = _prediction(asset.grid, scores=source == "pixie-predictions")
+        _write_prediction(folder, prediction, asset)
+    elif source != "pixieverse":
         cells, _ = shown_in_cells(asset.views[0].coords, resolution)
         write_field(root, source, asset.object_id, asset.grid, cells)
-        return
-    folder = root / asset.object_id
-    mask = asset.occupancy.astype(np.float32)
-    if source == "pixieverse":
-        (folder / "sample_0").mkdir(parents=True, exist_ok=True)
-        np.save(folder / "sample_0" / "material_grid.npy", asset.grid)
-        np.save(folder / "clip_features_mask.npy", mask)
+    else:
+        for k, grid in enumerate([asset.grid] if samples is None else samples):
+            (folder / f"sample_{k}").mkdir(parents=True, exist_ok=True)
+            np.save(folder / f"sample_{k}" / "material_grid.npy", grid)
+        np.save(folder / "clip_features_mask.npy", asset.occupancy.astype(np.float32))
         np.savez(
             folder / "clip_features.npz",
             min_bounds=np.full(3, -0.5),
@@ -64,11 +70,12 @@ def write_annotated(
             alpha_weighted=np.bool_(True),
             alpha_threshold_for_mask=np.float64(0.01),
         )
-        return
+
+
+def _write_prediction(folder: Path, prediction: NDArray[np.float32], asset: DemoAsset) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    scores = source == "pixie-predictions"
-    np.save(folder / "sample_0_pred.npy", _prediction(asset.grid, scores))
-    np.save(folder / "sample_0_mask.npy", mask)
+    np.save(folder / "sample_0_pred.npy", prediction)
+    np.save(folder / "sample_0_mask.npy", asset.occupancy.astype(np.float32))
 
 
 def _prediction(grid: NDArray[np.float32], scores: bool = True) -> NDArray[np.float32]:
@@ -94,10 +101,7 @@ def write_results(root: Path, asset: DemoAsset) -> None:
     prediction = _prediction(shifted)
     prediction[:3] += rng.normal(0.0, 0.1, size=(3, 1, 1, 1))
     prediction[:3] += rng.normal(0.0, 0.1, size=prediction[:3].shape)
-    folder = root / asset.object_id
-    folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "sample_0_pred.npy", prediction)
-    np.save(folder / "sample_0_mask.npy", asset.occupancy.astype(np.float32))
+    _write_prediction(root / asset.object_id, prediction, asset)
 
 
 SHAPE_LATENTS = "shape_latents/shape_enc_next_dc_f16c32_fp16"
@@ -115,20 +119,15 @@ def write_slat(
     for view in asset.views:
         stem = root / name / view.view if view.view else root / name
         stem.parent.mkdir(parents=True, exist_ok=True)
-        if form == "npz":
-            np.savez(stem.with_suffix(".npz"), coords=view.coords, feats=view.feats)
-        elif form == "npz-batch":
-            coords = np.pad(view.coords.astype(np.int32), ((0, 0), (1, 0)))
-            np.savez(stem.with_suffix(".npz"), coords=coords, feats=view.feats)
+        arrays: dict[str, NDArray[Any]] = {"coords": view.coords, "feats": view.feats}
+        if form == "npz-batch":
+            arrays["coords"] = np.pad(view.coords.astype(np.int32), ((0, 0), (1, 0)))
+        if form.startswith("npz"):
+            np.savez(stem.with_suffix(".npz"), allow_pickle=False, **arrays)
+        elif form == "hdf5":
+            write_hdf5(stem.with_suffix(".h5"), arrays)
         else:
-            import h5py
-
-            grouped = form == "hdf5-groups"
-            path = root / "latents.h5" if grouped else stem.with_suffix(".h5")
-            with h5py.File(path, "a" if grouped else "w") as file:
-                group = file.require_group(name) if grouped else file
-                for key, value in (("coords", view.coords), ("feats", view.feats)):
-                    group.create_dataset(key, data=value, track_times=False)
+            write_hdf5(root / "latents.h5", arrays, f"{name}/")
 
 
 def write_truth(root: Path, asset: DemoAsset, source: Source) -> None:
@@ -151,25 +150,6 @@ def write_truth(root: Path, asset: DemoAsset, source: Source) -> None:
         np.savez(path, allow_pickle=False, **truth)
 
 
-def write_categories(path: Path, entries: Iterable[tuple[str, str]]) -> None:
-    """Write Pixie's ``obj_ids_metadata.json`` from pairs of object id and category."""
-    metadata = {
-        object_id: {"obj_class": category, "vlm_filtering": {"is_appropriate": True}}
-        for object_id, category in entries
-    }
-    path.write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
-
-
-def write_trellis_metadata(path: Path, entries: Iterable[tuple[str, str, int]]) -> None:
-    """Write TRELLIS's ``metadata.csv`` from sha256, object id and number of voxels."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["sha256", "file_identifier", "aesthetic_score", "num_voxels"])
-        for sha256, object_id, voxels in entries:
-            url = f"https://sketchfab.com/3d-models/{object_id}"
-            writer.writerow([sha256, url, "6.0", voxels])
-
-
 SPREAD = np.array([0.03, 0.15, 0.02])
 """Standard deviation of a part's log10 density, log10 Young's modulus and Poisson's ratio."""
 
@@ -186,8 +166,7 @@ def sample_grids(seed: int, index: int, asset: DemoAsset, samples: int) -> NDArr
     In each part, log density, log Young's modulus and Poisson's ratio are drawn about the true
     values with `SPREAD`. A sample does not depend on the number of samples.
     """
-    known = asset.grid[..., 3] >= 0
-    known &= asset.grid[..., 3] != BACKGROUND
+    known = (asset.grid[..., 3] >= 0) & (asset.grid[..., 3] != BACKGROUND)
     parts, part_of = np.unique(asset.grid[known], axis=0, return_inverse=True)
     grids = np.repeat(asset.grid[None], samples, axis=0)
     for k, grid in enumerate(grids):
@@ -200,11 +179,3 @@ def sample_grids(seed: int, index: int, asset: DemoAsset, samples: int) -> NDArr
         drawn[:, 3] = np.where(mistaken, rng.integers(BACKGROUND, size=len(parts)), drawn[:, 3])
         grid[known] = drawn[part_of.reshape(-1)]
     return grids
-
-
-def write_samples(root: Path, asset: DemoAsset, grids: NDArray[np.float32]) -> None:
-    """Write annotations as ``sample_<k>/material_grid.npy`` of an asset below `root`."""
-    for k, grid in enumerate(grids):
-        folder = root / asset.object_id / f"sample_{k}"
-        folder.mkdir(parents=True, exist_ok=True)
-        np.save(folder / "material_grid.npy", grid)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,22 +82,33 @@ def deform(
     Positions and rotations are those of the file's `axes`. With `stretch` the scales follow
     too: the covariance becomes F C F^T.
     """
+    from scipy.spatial.transform import Rotation
+
     turn = SAVED_AXES[axes]
     moved = vertices.copy()
-    for axis, values in zip("xyz", (places @ turn.T).T, strict=True):
-        moved[axis] = values
+    _set_columns(moved, "xyz", places @ turn.T)
     local = turn @ gradients @ turn.T
-    before = _matrices(vertices)
-    if not stretch:
-        _set_rotations(moved, rotations(local) @ before)
-        return moved
-    scales = np.exp(np.stack([vertices[name] for name in _SCALE], axis=1).astype(np.float64))
-    left, lengths, _ = np.linalg.svd(local @ before * scales[:, None, :])
-    left[np.linalg.det(left) < 0, :, 2] *= -1
-    _set_rotations(moved, left)
-    for name, values in zip(_SCALE, np.log(np.maximum(lengths, 1e-12)).T, strict=True):
-        moved[name] = values
+    # Quaternions begin with the scalar.
+    before = Rotation.from_quat(np.roll(_columns(vertices, _ROTATION), -1, axis=1)).as_matrix()
+    if stretch:
+        scales = np.exp(_columns(vertices, _SCALE))
+        after, lengths, _ = np.linalg.svd(local @ before * scales[:, None, :])
+        after[np.linalg.det(after) < 0, :, 2] *= -1
+        _set_columns(moved, _SCALE, np.log(np.maximum(lengths, 1e-12)))
+    else:
+        after = rotations(local) @ before
+    _set_columns(moved, _ROTATION, np.roll(Rotation.from_matrix(after).as_quat(), 1, axis=1))
     return moved
+
+
+def _columns(vertices: NDArray[Any], names: Iterable[str]) -> NDArray[np.float64]:
+    """Return fields of Gaussians (G,), a column for each."""
+    return np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
+
+
+def _set_columns(vertices: NDArray[Any], names: Iterable[str], values: NDArray[np.float64]) -> None:
+    for name, column in zip(names, values.T, strict=True):
+        vertices[name] = column
 
 
 def gaussians_of(
@@ -105,10 +116,8 @@ def gaussians_of(
 ) -> NDArray[Any]:
     """Make a Gaussian at each position (N, 3) of the SLAT frame, in the colour of its class."""
     made = np.zeros(len(positions), dtype=[(name, "<f4") for name in _FIELDS])
-    for axis, values in zip("xyz", positions.T, strict=True):
-        made[axis] = values
-    for name, values in zip(_COLOUR, COLOURS[material].T / 255, strict=True):
-        made[name] = (values - 0.5) / _SH
+    _set_columns(made, "xyz", positions)
+    _set_columns(made, _COLOUR, (COLOURS[material] / 255 - 0.5) / _SH)
     made["opacity"], made["rot_0"] = 6.0, 1.0
     for name in _SCALE:
         made[name] = np.log(0.5 * spacing)
@@ -117,8 +126,7 @@ def gaussians_of(
 
 def colours_of(vertices: NDArray[Any]) -> NDArray[np.float64]:
     """Return the red, green and blue (G, 3) of Gaussians, 0 to 1, from their first harmonic."""
-    harmonics = np.stack([vertices[name] for name in _COLOUR], axis=1).astype(np.float64)
-    return np.clip(0.5 + _SH * harmonics, 0.0, 1.0)
+    return np.clip(0.5 + _SH * _columns(vertices, _COLOUR), 0.0, 1.0)
 
 
 def require_gaussians(vertices: NDArray[Any] | None, path: Path) -> NDArray[Any]:
@@ -135,22 +143,6 @@ def write_gaussians(path: Path, vertices: NDArray[Any], comment: str) -> None:
     kinds = {name: vertices.dtype[name].kind for name in vertices.dtype.names or ()}
     layout = [(name, "<f4" if kind == "f" else "<i4") for name, kind in kinds.items()]
     write_ply(path, vertices.astype(layout), comment)
-
-
-def _matrices(vertices: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the rotations (G, 3, 3) of Gaussians, whose quaternions begin with the scalar."""
-    from scipy.spatial.transform import Rotation
-
-    w, x, y, z = (np.asarray(vertices[name], dtype=np.float64) for name in _ROTATION)
-    return np.asarray(Rotation.from_quat(np.stack([x, y, z, w], 1)).as_matrix())
-
-
-def _set_rotations(vertices: NDArray[Any], matrices: NDArray[np.float64]) -> None:
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(matrices).as_quat().T
-    for name, values in zip(_ROTATION, (w, x, y, z), strict=True):
-        vertices[name] = values
 
 
 _PAPER = 255.0
@@ -186,30 +178,22 @@ def draw(
     height, width = np.ceil(np.ptp(seen, axis=0)[::-1] * scale).astype(int)
     at = (places @ view - seen.min(axis=0)) * scale
     depth = places @ away
-    spread = np.exp(np.stack([vertices[f"scale_{i}"] for i in range(3)], 1).astype(float))
-    radius = np.clip(spread.mean(axis=1) * scale * 1.5, 0.7, 8.0)
-    colours = colours_of(vertices) * 255
+    radius = np.clip(np.exp(_columns(vertices, _SCALE)).mean(axis=1) * scale * 1.5, 0.7, 8.0)
     shade = 1.0 - 0.35 * (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
-    colours = colours * shade[:, None]
+    colours = colours_of(vertices) * 255 * shade[:, None]
     shown = 1 / (1 + np.exp(-np.asarray(vertices["opacity"], dtype=float))) > 0.3
     image = np.full((height, width, 3), _PAPER)
-    nearest = np.full(height * width, np.inf)
+    front = np.argsort(depth, kind="stable")  # The nearest first.
+    rank, least = np.argsort(front), np.full(height * width, len(front))
     reach = int(np.ceil(radius.max()))
-    winner = np.full(height * width, -1)
     for dy in range(-reach, reach + 1):
         for dx in range(-reach, reach + 1):
             inside = shown & (dx * dx + dy * dy <= radius**2)
             x, y = (np.rint(at[:, axis]).astype(int) + d for axis, d in ((0, dx), (1, dy)))
             rows = np.flatnonzero(inside & (x >= 0) & (x < width) & (y >= 0) & (y < height))
-            cells = y[rows] * width + x[rows]
-            order = np.argsort(-depth[rows], kind="stable")  # The nearest comes last, and stays.
-            best = np.full(height * width, -1)
-            best[cells[order]] = rows[order]
-            there = np.flatnonzero(best >= 0)
-            closer = there[depth[best[there]] < nearest[there]]
-            nearest[closer], winner[closer] = depth[best[closer]], best[closer]
-    drawn = winner >= 0
-    image.reshape(-1, 3)[drawn] = colours[winner[drawn]]
+            np.minimum.at(least, y[rows] * width + x[rows], rank[rows])
+    drawn = least < len(front)
+    image.reshape(-1, 3)[drawn] = colours[front[least[drawn]]]
     return image.astype(np.uint8)
 
 

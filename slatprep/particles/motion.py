@@ -23,29 +23,6 @@ _HELD = tuple(MATERIAL_CLASSES.index(name) for name in ("stationary", "sand"))
 """Pots and soil, which hold in the wind what grows in them."""
 
 
-class Override(NamedTuple):
-    """Class, Young's modulus [Pa] and density [kg/m^3] for a whole object; None keeps them."""
-
-    material: str | None = None
-    young: float | None = None
-    density: float | None = None
-
-
-class Motion(NamedTuple):
-    """Width of the unit cube [m], height of the fall [m], wind [m/s], length [s], frames a second.
-
-    Each frame has so many `substeps`; without a `device` the GPU computes if there is one.
-    """
-
-    size: float
-    height: float
-    wind: float
-    seconds: float
-    rate: int
-    substeps: int
-    device: str | None
-
-
 class Scene(NamedTuple):
     """Particles (N, 3) in the SLAT frame, their materials, and the Gaussians that they carry.
 
@@ -76,35 +53,38 @@ def prepare(
     gaussians: Path | None,
     axes: Axes | None,
     count: int,
-    override: Override,
+    material: str | None = None,
+    young: float | None = None,
+    density: float | None = None,
 ) -> Scene:
     """Fill the object with a lattice of `count` particles a side, and bring its Gaussians along.
 
-    The SLAT's voxels `cells`, by default those of the field, are the surface of the object.
+    The SLAT's voxels `cells`, by default those of the field, are the surface of the object. Class,
+    Young's modulus [Pa] and density [kg/m^3] are for the whole object; None keeps the field's.
     """
     solid = filled(occupancy_of(field.voxels if cells is None else cells))
     lattice = (np.indices((count,) * 3).reshape(3, -1).T + 0.5) / count - 0.5
     inside = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
     positions = lattice[solid[tuple(inside.T)]]
     given = transfer(positions, field, far="nearest")
-    material, properties = given.material.copy(), given.properties.copy()
-    if override.material is not None:
-        material[:] = MATERIAL_CLASSES.index(override.material)
-    for column, value in ((0, override.young), (1, override.density)):
+    classes, properties = given.material.copy(), given.properties.copy()
+    if material is not None:
+        classes[:] = MATERIAL_CLASSES.index(material)
+    for column, value in ((0, young), (1, density)):
         if value is not None:
             properties[:, column] = value
+    own = positions, 1 / count, classes, properties
     if gaussians is None:
-        vertices = splats.gaussians_of(positions, material, 1 / count)
-        return Scene(positions, 1 / count, material, properties, vertices, positions, "slat", ())
+        return Scene(
+            *own, splats.gaussians_of(positions, classes, 1 / count), positions, "slat", ()
+        )
     surface = field
     if cells is not None:
         nothing = np.zeros(len(cells), np.uint8), np.ones((len(cells), 3), np.float32)
         surface = VoxelField(cells, *nothing)
     read, notes = _read(gaussians, axes, field, surface)
     vertices = splats.require_gaussians(read.vertices, gaussians)
-    return Scene(
-        positions, 1 / count, material, properties, vertices, read.in_slat(), read.axes, notes
-    )
+    return Scene(*own, vertices, read.in_slat(), read.axes, notes)
 
 
 def _read(
@@ -120,25 +100,30 @@ def _read(
     return read, tuple(notes)
 
 
-def run(scene: Scene, how: Motion) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Simulate the particles; return positions (F, N, 3) in the SLAT frame, and gradients."""
+def run(
+    scene: Scene, *, size: float, height: float, wind: float, device: str | None, **times: Any
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Simulate the particles; return positions (F, N, 3) in the SLAT frame, and gradients.
+
+    The unit cube is `size` [m] wide and falls from `height` [m], or stands in the `wind` [m/s];
+    `times` are seconds, rate and substeps of `simulate_motion`. Without a `device` the GPU computes
+    if there is one.
+    """
     from slatprep.particles.simulate import preferred_device, simulate_motion
 
-    size, windy = how.size, how.wind != 0
+    windy = wind != 0
     foot = scene.positions[:, 2] < scene.positions[:, 2].min() + 1.5 * scene.spacing
     moved = simulate_motion(
         scene.positions * size,
         scene.material,
         scene.properties,
         scene.spacing * size,
-        height=0.0 if windy else how.height,
+        height=0.0 if windy else height,
         gravity=0.0 if windy else 9.81,
-        wind=(how.wind, 0.0, 0.0),
+        wind=(wind, 0.0, 0.0),
         fixed=(foot | np.isin(scene.material, _HELD)) if windy else None,
-        seconds=how.seconds,
-        rate=how.rate,
-        substeps=how.substeps,
-        device=how.device or preferred_device(),
+        device=device or preferred_device(),
+        **times,
     )
     # The first frame is where the SLAT has the object.
     shift = moved.positions[0] - scene.positions * size
@@ -149,7 +134,7 @@ def write_frames(
     out: Path,
     scene: Scene,
     moved: tuple[NDArray[np.float64], NDArray[np.float32]],
-    how: Motion,
+    rate: int,
     picture: Path | None,
     stretch: bool,
     progress: Callable[[int, int], None],
@@ -169,5 +154,5 @@ def write_frames(
             pictures.append(splats.draw(rows, places, low, high))
         progress(number + 1, frames)
     if picture is not None:
-        splats.write_picture(picture, pictures, how.rate)
+        splats.write_picture(picture, pictures, rate)
     return frames

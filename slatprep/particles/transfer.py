@@ -95,10 +95,9 @@ def recognise_axes(
     """
     if not particles.guessed:
         return particles, ""
-    some = particles.positions[:: max(1, len(particles.positions) // 20_000)]
     tried, apart = {}, {}
     for axes in _GAUSSIAN_AXES:
-        points = Particles(some, axes).in_slat()
+        points = _some(particles, axes)
         tried[axes] = transfer(points, field, max_distance=max_distance, far="nearest")
         apart[axes] = float(np.minimum(tried[axes].distance, 2 * max_distance).mean())
     best, other = sorted(_GAUSSIAN_AXES, key=lambda axes: apart[axes])
@@ -137,9 +136,8 @@ def doubt_axes(
         return ""
     shares: dict[Axes, float] = {}
     for axes in get_args(Axes):
-        some = Particles(particles.positions[:: max(1, count // 20_000)], axes)
-        tried = transfer(some.in_slat(), field, max_distance=max_distance)
-        shares[axes] = tried.far / len(some.positions)
+        some = _some(particles, axes)
+        shares[axes] = transfer(some, field, max_distance=max_distance).far / len(some)
     points = particles.in_slat()
     distance = transfer(points, field, max_distance=max_distance).distance
     far = distance > max_distance
@@ -168,6 +166,12 @@ def doubt_axes(
     if result.far > MOST_FAR * count or shares[fitting] < 0.1 * shares[particles.axes]:
         raise ConfigError(f"{why}. If all is right, --max-distance may be larger")
     return why
+
+
+def _some(particles: Particles, axes: Axes) -> NDArray[np.float64]:
+    """Return 20,000 to 40,000 particles, or all if these are fewer, as if they had these axes."""
+    some = particles.positions[:: max(1, len(particles.positions) // 20_000)]
+    return Particles(some, axes).in_slat()
 
 
 def _enclosed(field: VoxelField, points: NDArray[np.float64]) -> float:

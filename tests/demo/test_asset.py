@@ -11,7 +11,7 @@ from slatprep.demo.asset import make_asset, object_id
 from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.difficulty import LEVELS, QUARTER_TURNS, SAME_SHAPE_LEVELS, draw_frames
 from slatprep.demo.latents import MEAN, STD
-from slatprep.demo.materials import MATERIALS
+from slatprep.demo.model import MATERIALS
 from slatprep.demo.shapes import Solid
 
 KINDS = range(2 * len(CATALOGUE))
