@@ -26,12 +26,12 @@ from slatprep.readers.slat import check_coords
 from slatprep.records import TRELLIS, StructuredLatents
 from slatprep.storage.atomic import staged
 from slatprep.storage.files import file_digest
-from slatprep.trellis_latents import FORMAT, sample_trellis
+from slatprep.trellis_latents import FORMAT, MODELS, move, sample_trellis
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-MODEL = "microsoft/TRELLIS-image-large"
+MODEL = MODELS["trellis"]
 """The model of TRELLIS that turns images into structured latents."""
 
 _LATENTS = (
@@ -89,33 +89,29 @@ def load_session(
     revision.
     """
     with redirect_stdout(sys.stderr):  # TRELLIS prints which kernels it takes when imported.
-        return _load_session(model, revision, device)
+        try:
+            import torch
+            from trellis.pipelines import TrellisImageTo3DPipeline
+        except ImportError as error:
+            raise ConfigError(
+                f"TRELLIS draws and decodes latents, and {error.name or 'a part of it'} is not "
+                "installed. Install TRELLIS as https://github.com/microsoft/TRELLIS says, and "
+                "slatprep into the same environment. It needs an NVIDIA GPU of at least 16 GB"
+            ) from error
+        if Path(model).is_dir():
+            if revision is not None:
+                raise ConfigError(
+                    f"{model} is a folder, which has no revision; leave --revision out"
+                )
+            folder, taken = Path(model), "local folder"
+        else:
+            # Fetched first, so that the commit that is loaded is known.
+            from huggingface_hub import snapshot_download
 
-
-def _load_session(model: str, revision: str | None, device: str | None) -> Session:
-    try:
-        import torch
-        from trellis.pipelines import TrellisImageTo3DPipeline
-    except ImportError as error:
-        raise ConfigError(
-            f"TRELLIS draws and decodes latents, and {error.name or 'a part of it'} is not "
-            "installed. Install TRELLIS as https://github.com/microsoft/TRELLIS says, and slatprep "
-            "into the same environment. It needs an NVIDIA GPU of at least 16 GB"
-        ) from error
-    if Path(model).is_dir():
-        if revision is not None:
-            raise ConfigError(f"{model} is a folder, which has no revision; leave --revision out")
-        folder, taken = Path(model), "local folder"
-    else:
-        # Fetched first, so that the commit that is loaded is known.
-        from huggingface_hub import snapshot_download
-
-        folder = Path(snapshot_download(model, revision=revision))
-        taken = folder.name
-    pipeline = TrellisImageTo3DPipeline.from_pretrained(str(folder))
-    if device is None:
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    pipeline.to(torch.device(device))
+            folder = Path(snapshot_download(model, revision=revision))
+            taken = folder.name
+        pipeline = TrellisImageTo3DPipeline.from_pretrained(str(folder))
+        device = move(pipeline, torch, device)
     about = {"name": model, "revision": taken, "torch": str(torch.__version__)}
     description = folder / "pipeline.json"
     if description.is_file():

@@ -39,22 +39,19 @@ Sampled = tuple[np.ndarray, np.ndarray, dict[str, float]]
 MODELS = {"trellis": "microsoft/TRELLIS-image-large", "trellis2": "microsoft/TRELLIS.2-4B"}
 
 
-class Stages:
-    """Time of each stage."""
+class Stages(dict[str, float]):
+    """The seconds of each of `STAGES` that has ended."""
 
     def __init__(self, torch: Any, device: Any) -> None:
-        self.torch, self.device = torch, device
-        self.ends = [time.perf_counter()]
+        self.torch, self.device, self.begin = torch, device, time.perf_counter()
 
     def end(self) -> None:
         """End a stage; kernels run asynchronously."""
         if str(self.device).startswith("cuda"):
             self.torch.cuda.synchronize()
-        self.ends.append(time.perf_counter())
-
-    def seconds(self) -> dict[str, float]:
-        """Return the seconds of each of `STAGES`."""
-        return dict(zip(STAGES, np.diff(self.ends).tolist(), strict=False))
+        now = time.perf_counter()
+        self[STAGES[len(self)]] = now - self.begin
+        self.begin = now
 
 
 def sample_trellis(pipeline: Any, torch: Any, image: Any, seed: int, preprocess: bool) -> Sampled:
@@ -74,7 +71,7 @@ def sample_trellis(pipeline: Any, torch: Any, image: Any, seed: int, preprocess:
         stages.end()
         slat = pipeline.sample_slat(cond, voxels)
         stages.end()
-    return *arrays_of(slat), stages.seconds()
+    return *arrays_of(slat), stages
 
 
 def sample_trellis2(
@@ -98,7 +95,7 @@ def sample_trellis2(
         model = pipeline.models["shape_slat_flow_model_" + kind]
         slat = pipeline.sample_shape_slat(cond, model, voxels)
         stages.end()
-    return *arrays_of(slat), stages.seconds()
+    return *arrays_of(slat), stages
 
 
 def sample_sam3d(inference: Any, torch: Any, image: Any, seed: int) -> Sampled:
@@ -185,6 +182,13 @@ def extract(
     return failed
 
 
+def move(pipeline: Any, torch: Any, device: str | None) -> str:
+    """Move a pipeline to a device, by default the GPU if there is one; return which it is."""
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    pipeline.to(torch.device(device))
+    return device
+
+
 def load(options: argparse.Namespace) -> Callable[[Any, int], Sampled]:
     """Load the generator, and return what samples an image with a seed."""
     with redirect_stdout(sys.stderr):
@@ -202,9 +206,7 @@ def load(options: argparse.Namespace) -> Callable[[Any, int], Sampled]:
         else:
             from trellis.pipelines import TrellisImageTo3DPipeline as Pipeline
         pipeline = Pipeline.from_pretrained(options.model or MODELS[options.generator])
-        device = options.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        pipeline.to(torch.device(device))
-        print(f"runs on {device}", file=sys.stderr)
+        print(f"runs on {move(pipeline, torch, options.device)}", file=sys.stderr)
     if options.generator == "trellis2":
         kind = options.pipeline
         return lambda image, seed: sample_trellis2(pipeline, torch, image, seed, preprocess, kind)

@@ -139,59 +139,17 @@ def _axis_slopes(position, spans, slopes, at):  # type: ignore[no-untyped-def]
 @kernel()
 def jacobians(points, origin, spacing, coefficients, out):  # type: ignore[no-untyped-def]
     """Write ``out[m, i, j]``, the derivative of displacement i along axis j, for each point."""
-    weights, slopes, mixed = np.zeros(12), np.zeros(12), np.zeros(12)
+    weights, mixed = np.zeros(12), np.zeros(12)
     flat, strides = coefficients.reshape(-1), strides_of(coefficients.shape)
     for m in range(points.shape[0]):
         first = locate(points[m], origin, spacing, coefficients.shape, weights)
         for axis in range(3):
             position = (points[m, axis] - origin[axis]) / spacing
-            _axis_slopes(position, coefficients.shape[axis] - 3, slopes, 4 * axis)
-        for axis in range(3):
             mixed[:] = weights
-            mixed[4 * axis : 4 * axis + 4] = slopes[4 * axis : 4 * axis + 4] / spacing
+            _axis_slopes(position, coefficients.shape[axis] - 3, mixed, 4 * axis)
+            mixed[4 * axis : 4 * axis + 4] /= spacing
             x, y, z = gather(flat, first, strides, mixed)
             out[m, 0, axis], out[m, 1, axis], out[m, 2, axis] = x, y, z
-
-
-@kernel()
-def least_stretch(affine, spacing, coefficients, steps):  # type: ignore[no-untyped-def]
-    """Return the least of 2 det / |J|^2 over a grid of `steps` points a span; J is the derivative.
-
-    It is a lower bound of the smallest singular value at those points, and
-    negative where one of them is folded.
-    """
-    shape = coefficients.shape
-    flat, strides = coefficients.reshape(-1), strides_of(shape)
-    point, origin, least = np.zeros(3), np.zeros(3), np.inf
-    weights, slopes, mixed = np.zeros(12), np.zeros(12), np.zeros(12)
-    jacobian = np.zeros((3, 3))
-    for i in range(steps * (shape[0] - 3) + 1):
-        for j in range(steps * (shape[1] - 3) + 1):
-            for k in range(steps * (shape[2] - 3) + 1):
-                point[0], point[1], point[2] = i / steps, j / steps, k / steps
-                first = locate(point, origin, 1.0, shape, weights)
-                for axis in range(3):
-                    _axis_slopes(point[axis], shape[axis] - 3, slopes, 4 * axis)
-                for axis in range(3):
-                    mixed[:] = weights
-                    for w in range(4 * axis, 4 * axis + 4):
-                        mixed[w] = slopes[w] / spacing
-                    x, y, z = gather(flat, first, strides, mixed)
-                    jacobian[0, axis] = affine[0, axis] + x
-                    jacobian[1, axis] = affine[1, axis] + y
-                    jacobian[2, axis] = affine[2, axis] + z
-                a, b, c = jacobian
-                determinant = (
-                    a[0] * (b[1] * c[2] - b[2] * c[1])
-                    - a[1] * (b[0] * c[2] - b[2] * c[0])
-                    + a[2] * (b[0] * c[1] - b[1] * c[0])
-                )
-                squares = 0.0
-                for row in range(3):
-                    for column in range(3):
-                        squares += jacobian[row, column] ** 2
-                least = min(least, 2.0 * determinant / squares)
-    return least
 
 
 def refined(coefficients: Array) -> Array:

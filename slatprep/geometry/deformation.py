@@ -117,12 +117,10 @@ def undeform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]
     """
     target = np.asarray(points, dtype=np.float64)
     affine = deformation.affine
-    start = (target - affine[:, 3]) @ np.linalg.inv(affine[:, :3]).T
-    found = start.copy()
+    trial = (target - affine[:, 3]) @ np.linalg.inv(affine[:, :3]).T
     if not deformation.coefficients.size:
-        return found
-    best = np.full(len(target), np.inf)
-    trial, open_ones = start, np.arange(len(target))
+        return np.asarray(trial)
+    found, best, open_ones = trial.copy(), np.full(len(target), np.inf), np.arange(len(target))
     for _ in range(_NEWTON_STEPS):
         error = deform(deformation, trial) - target[open_ones]
         length = np.linalg.norm(error, axis=1)
@@ -158,10 +156,8 @@ def make_deformation(
         _rounded(affine), _rounded(origin), float(_rounded(spacing)), _rounded(coefficients)
     )
     matrix = made.affine[:, :3]
-    stretches = np.linalg.svd(matrix, compute_uv=False)
-    if np.linalg.det(matrix) <= 0 or not (
-        stretches[-1] >= LEAST_STRETCH and stretches[0] <= MOST_STRETCH
-    ):
+    most, _, least = np.linalg.svd(matrix, compute_uv=False)
+    if np.linalg.det(matrix) <= 0 or not (least >= LEAST_STRETCH and most <= MOST_STRETCH):
         return None
     limit = max_displacement / RESOLUTION
     points = np.asarray(points, dtype=np.float64)
@@ -192,12 +188,20 @@ def is_proper(deformation: Deformation) -> bool:
     c, spacing = deformation.coefficients, deformation.spacing
     if not c.size:
         return bool(np.linalg.det(deformation.affine[:, :3]) > 0)
-    from slatprep.geometry.bspline import least_stretch
-
     fall = _second_derivative(c, np.max) / spacing**2 * np.sqrt(3.0) / 2.0 * spacing
-    return any(
-        least_stretch(deformation.affine, spacing, c, steps) > fall / steps for steps in (2, 4)
-    )
+    return any(_least_stretch(deformation, steps) > fall / steps for steps in (2, 4))
+
+
+def _least_stretch(deformation: Deformation, steps: int) -> float:
+    """Return the least of 2 det / |J|^2 over a grid of `steps` points a span."""
+    # In units of spans, so that rounding leads none of them out of the domain.
+    spans = replace(deformation, affine=np.zeros((3, 4)), origin=np.zeros(3), spacing=1.0)
+    at = [np.arange(steps * (n - 3) + 1) / steps for n in deformation.coefficients.shape[:3]]
+    points = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1).reshape(-1, 3)
+    slopes = deformation.affine[:, :3] + jacobian(spans, points) / deformation.spacing
+    a, b, c = np.moveaxis(slopes, 1, 0)
+    determinant = (a * np.cross(b, c)).sum(axis=1)
+    return float((2.0 * determinant / (slopes**2).sum(axis=(1, 2))).min())
 
 
 def bending_of(deformation: Deformation) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from slatprep.judge.ambiguity import measure_ambiguity
 from slatprep.judge.verdict import (
     THRESHOLDS,
-    Thresholds,
     contradicted,
     judge,
     merged,
@@ -16,7 +15,6 @@ from slatprep.judge.verdict import (
 
 __all__ = [
     "THRESHOLDS",
-    "Thresholds",
     "contradicted",
     "judge",
     "measure_ambiguity",

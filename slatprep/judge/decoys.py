@@ -42,10 +42,11 @@ LIKE_DECOYS = 0.3
 DRAWS, LIKELY = 4_000, (0.025, 0.975)
 """Draws and ends of an interval."""
 
-LEARNED = ("directions_near", "directions_middle", "directions_worst", "blocks_near",
-           "blocks_middle", "blocks_far", "slat_within_1", "pixieverse_within_1", "moved",
-           "bending", "stretch", "valid_share")  # fmt: skip
-"""Figures whose weight a dataset may change."""
+LEARNED = {"directions_near": -1, "directions_middle": -1, "directions_worst": -1,
+           "blocks_near": 1, "blocks_middle": 1, "blocks_far": 1, "slat_within_1": 1,
+           "pixieverse_within_1": 1, "moved": -1, "bending": -1, "stretch": -1,
+           "valid_share": 1}  # fmt: skip
+"""Figures whose weight a dataset may change, and whether what is right has more or less of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +193,8 @@ def _posterior_errors(scores: Array, decoy_scores: Array, share: float) -> Array
     decoys = np.append(decoy_scores, max(scores.max(), decoy_scores.max()))
     values = np.concatenate([scores, decoys])
     each = share * len(scores) / len(decoys)
-    weights = np.concatenate([np.ones(len(scores)), np.full(len(decoys), max(each, 1e-12))])
-    wrong = np.concatenate([np.zeros(len(scores)), np.ones(len(decoys))])
+    wrong = np.repeat([0.0, 1.0], [len(scores), len(decoys)])
+    weights = np.where(wrong > 0, max(each, 1e-12), 1.0)
     which = np.unique(values, return_inverse=True)[1]
     mass = np.bincount(which, weights)
     ratio = np.bincount(which, weights * wrong) / mass
@@ -229,19 +230,12 @@ def _refitted(
 
 def _features(evidence: Array, decoy: NDArray[np.bool_]) -> Array:
     """Return the shipped model's score and `LEARNED`, better where larger, in decoys' spreads."""
-    contributions = SAME_OBJECT.contributions(evidence)
-    score = contributions.sum(axis=1) + SAME_OBJECT.intercept
+    score = SAME_OBJECT.contributions(evidence).sum(axis=1) + SAME_OBJECT.intercept
     columns = [FIGURES.index(name) for name in LEARNED]
-    signs = np.array([_sign(name) for name in LEARNED])
-    chosen = np.nan_to_num(evidence[:, columns] * signs)
+    chosen = np.nan_to_num(evidence[:, columns] * np.array(list(LEARNED.values())))
     centre, spread = chosen[decoy].mean(axis=0), chosen[decoy].std(axis=0)
     others = np.clip((chosen - centre) / np.maximum(spread, 1e-9), -4.0, 4.0)
     return np.column_stack([np.clip(score, -15.0, 15.0), others])
-
-
-def _sign(name: str) -> float:
-    grows = name.startswith(("blocks", "slat_within", "pixieverse_within", "valid"))
-    return 1.0 if grows else -1.0
 
 
 def _fit(right: Array, wrong: Array) -> Array:
@@ -250,10 +244,8 @@ def _fit(right: Array, wrong: Array) -> Array:
     The shipped score's weight is held to 1 and the others to 0; none is negative.
     """
     x = np.concatenate([right, wrong])
-    y = np.concatenate([np.ones(len(right)), -np.ones(len(wrong))])
-    weights = np.concatenate(
-        [np.full(len(right), 0.5 / len(right)), np.full(len(wrong), 0.5 / len(wrong))]
-    )
+    y = np.repeat([1.0, -1.0], [len(right), len(wrong)])
+    weights = np.where(y > 0, 0.5 / len(right), 0.5 / len(wrong))
     prior = np.append(np.eye(1, x.shape[1])[0], 0.0)
     ridge = RIDGE / min(len(right), len(wrong)) * np.append(np.ones(x.shape[1]), 0.1)
 
@@ -265,6 +257,4 @@ def _fit(right: Array, wrong: Array) -> Array:
         return value, np.append(x.T @ slope, slope.sum()) + ridge * off
 
     bounds = [(0.0, None)] * x.shape[1] + [(None, None)]
-    found = minimize(loss, prior, jac=True, bounds=bounds, method="L-BFGS-B")
-    fitted: Array = found.x
-    return fitted
+    return np.asarray(minimize(loss, prior, jac=True, bounds=bounds, method="L-BFGS-B").x)

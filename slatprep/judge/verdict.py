@@ -261,7 +261,8 @@ def verdict_of(
     limits = THRESHOLDS
     reasons: list[str] = []
     if math.isnan(same_object * right_placement):
-        failed = _judge_by_fitness(quality, reasons)
+        failed = min(quality.fitness, quality.fitness_backward) < limits.failed_fitness
+        reasons += _low_fitness(quality)
     else:
         # Among placements that tie nobody has chosen yet: any of them may be right.
         tied = ties > 0 and ambiguity > limits.good_ambiguity
@@ -314,28 +315,21 @@ def _doubts(
         f"{right_placement:.1%} {good}"
     )
     doubts = sorted([(same_object, of_object), (right_placement, of_placement)])
+    # Either that alone would take half of what may be taken is told.
+    told = [text for likely, text in doubts if likely < limits.good_confidence**0.5]
+    reasons = told or [doubts[0][1]]
     if same_object < limits.failed_confidence:
         reasons = [of_object]  # On another object no placement is right.
-    else:
-        # Either that alone would take half of what may be taken is told.
-        told = [text for likely, text in doubts if likely < limits.good_confidence**0.5]
-        reasons = told or [doubts[0][1]]
     if same_object <= right_placement:
-        _judge_by_fitness(quality, reasons)
+        reasons += _low_fitness(quality)
     return reasons
 
 
-def _judge_by_fitness(quality: Quality, reasons: list[str]) -> bool:
-    """Append what is low of the two fitnesses; return whether either is below failed."""
-    limits = THRESHOLDS
-    sides = (
-        ("PixieVerse boundary", quality.fitness),
-        ("SLAT boundary", quality.fitness_backward),
-    )
-    for name, fitness in sides:
-        if fitness < limits.good_fitness:
-            reasons.append(
-                f"only {fitness:.1%} of the {name} lies within {quality.radius:g} voxel of the "
-                f"other side (good needs {limits.good_fitness:.0%})"
-            )
-    return any(fitness < limits.failed_fitness for _, fitness in sides)
+def _low_fitness(quality: Quality) -> list[str]:
+    """Say which of the two fitnesses is low."""
+    return [
+        f"only {fitness:.1%} of the {side} boundary lies within {quality.radius:g} voxel of the "
+        f"other side (good needs {THRESHOLDS.good_fitness:.0%})"
+        for side, fitness in (("PixieVerse", quality.fitness), ("SLAT", quality.fitness_backward))
+        if fitness < THRESHOLDS.good_fitness
+    ]

@@ -15,6 +15,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,12 +192,8 @@ def fit_models(moments: Iterable[tuple[str, Moments]]) -> list[LatentModel] | No
     models = []
     for fold in range(FOLDS):
         others = [sums[other] for other in sorted(sums) if other != fold]
-        if not others:
-            return None
-        seen = others[0]
-        for other in others[1:]:
-            seen = seen + other
-        if np.count_nonzero(seen.weight) < 2:
+        seen = reduce(add, others) if others else None
+        if seen is None or np.count_nonzero(seen.weight) < 2:
             return None
         models.append(_model_of(seen))
     return models

@@ -7,14 +7,12 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from support import commands
 
 from slatprep import open_store
-from slatprep.cli.commands import slatprep as command
 from slatprep.demo import make_demo
 from slatprep.demo.latents import GRIDS, Encoder
 from slatprep.demo.sources import CLASSES, ONE_FRAME, TABLE, Source, columns_of
-from slatprep.errors import ConfigError
 
 NAMES = [str(one["name"]) for one in TABLE]
 HELD = {
@@ -23,28 +21,22 @@ HELD = {
 }
 
 
-def run(*arguments: str) -> str:
-    result = CliRunner().invoke(command, arguments)
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
-def printed(output: str, word: str) -> list[str]:
+def run_printed(output: str, word: str, *more: str) -> str:
+    """Run the command that a line of an output tells; return what it prints."""
     (line,) = (line for line in output.splitlines() if line.startswith(word))
-    return shlex.split(line.partition(" slatprep ")[2])
+    return commands.run(*shlex.split(line.partition(" slatprep ")[2]), *more).output
 
 
 @pytest.mark.parametrize("source", get_args(Source))
 def test_two_commands_show_a_source_and_a_third_its_truth(tmp_path, source):
-    out = str(tmp_path / "demo")
-    said = run("make-demo", out, "--assets", "2", "--level", "0", "--source", source)
-    run(*printed(said, "a store of it:"))
-    score = json.loads(run(*printed(said, "its score:"), "--json"))
+    words = ("--assets", 2, "--level", 0, "--source", source)
+    said = commands.run("make-demo", tmp_path / "demo", *words).output
+    run_printed(said, "a store of it:")
+    score = json.loads(run_printed(said, "its score:", "--json"))
     assert len(score["assets"]) == 2
     for asset in score["assets"]:
         assert asset["displacement"] < 0.1
-        assert asset["label_accuracy"] > 0.98
-        assert asset["valid_share"] > 0.98
+        assert min(asset["label_accuracy"], asset["valid_share"]) > 0.98
     store = open_store(tmp_path / "demo.zarr")
     held = HELD.get(source, ["youngs_modulus", "density", "poissons_ratio"])
     assert store.attributes["property_columns"] == held
@@ -79,10 +71,8 @@ def test_properties_of_plain_voxels_are_what_a_material_can_have():
 
 @pytest.mark.parametrize("encoder", [name for name in get_args(Encoder) if name != "trellis"])
 def test_latents_of_every_encoder_are_carried(tmp_path, encoder):
-    out = str(tmp_path / "demo")
-    options = ("--level", "0", "--encoder", encoder, "--latents", "material")
-    said = run("make-demo", out, "--assets", "1", *options)
-    run(*printed(said, "a store of it:"))
+    words = ("--assets", 1, "--level", 0, "--encoder", encoder, "--latents", "material")
+    run_printed(commands.run("make-demo", tmp_path / "demo", *words).output, "a store of it:")
     store = open_store(tmp_path / "demo.zarr")
     assert store.contents.latents.encoder == encoder
     assert store.contents.latents.channels == GRIDS[encoder][0]
@@ -110,21 +100,7 @@ def test_a_wrong_frame_of_any_source_is_caught(tmp_path, source):
                 frame = file["transform"]
             np.save(root / f"{truth.stem}.frame.npy", TURN @ frame if wrong else frame)
         out = tmp_path / f"{expected}.zarr"
-        run("build-store", "--config", str(made.config), "--out", str(out))
+        commands.run("build-store", "--config", made.config, "--out", out)
         store = open_store(out)
         assert set(store.column("engine")) == {"known"}
         assert set(store.column("verdict")) == {expected}
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"source": "vomp", "levels": (1,)},
-        {"source": "physxnet", "views": 2},
-        {"encoder": "trellis2", "slat_form": "hdf5"},
-    ],
-)
-def test_what_does_not_go_together_is_refused(tmp_path, wrong):
-    with pytest.raises(ConfigError, match=str(next(iter(wrong.values())))):
-        make_demo(tmp_path / "demo", 1, 0, **wrong)
-    assert not (tmp_path / "demo").exists()

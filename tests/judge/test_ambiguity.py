@@ -5,34 +5,29 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.shapes import GRID, chair, field_of, surface_latents
+from support.shapes import GRID, aligned, chair, field_of, latents_of, surface_latents
 
 from slatprep.align import align
 from slatprep.geometry.deformation import map_of
+from slatprep.geometry.frames import cube_symmetries, make_transform
 from slatprep.judge import measure_ambiguity
 from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, thinning
 from slatprep.judge.evidence import surroundings_of
 from slatprep.parameters import AlignParameters, SampleParameters
-from slatprep.records import (
-    Alignment,
-    Ambiguity,
-    Annotation,
-    MaterialField,
-    Placement,
-    StructuredLatents,
-)
+from slatprep.records import Ambiguity, Annotation, MaterialField
 from slatprep.sample import sample
 
 BALL = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
 
 
-def _ambiguity(
-    occupancy: np.ndarray, material: np.ndarray | None = None
-) -> tuple[Alignment, Ambiguity]:
+PARAMETERS = SampleParameters()
+
+
+def _ambiguity(occupancy: np.ndarray, material: np.ndarray | None = None) -> tuple[Any, Ambiguity]:
     field, latents = field_of(occupancy, material), surface_latents(occupancy)
     alignment = align(field, latents, AlignParameters())
-    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-    return alignment, measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), PARAMETERS)
+    return alignment, measure_ambiguity(field, latents, alignment, annotation, PARAMETERS)
 
 
 def test_a_ball_of_one_material_is_ambiguous_and_harmless() -> None:
@@ -73,20 +68,18 @@ def test_a_chair_has_one_placement() -> None:
     assert alignment.margin > 0.1
 
 
-def test_a_full_slat_is_judged_by_some_of_its_voxels_and_ties(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_full_slat_is_judged_by_some_of_its_voxels_and_ties(monkeypatch):
     ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 27**2
     field = field_of(ball, np.where(GRID[..., 2] < 32, 1, 3))
-    coords = np.argwhere(ball).astype(np.uint8)
-    latents = StructuredLatents(coords, np.zeros((len(coords), 8), np.float32))
-    alignment = align(field, latents, AlignParameters())
-    annotation = sample(field, map_of(alignment).places(coords), SampleParameters())
-    assert len(coords) > 2 * MOST_VOXELS and len(alignment.placements) == 23
+    latents = latents_of(np.argwhere(ball))
+    turns = [make_transform(turn) for turn in cube_symmetries() if np.linalg.det(turn) > 0]
+    alignment = aligned(*turns)
+    annotation = sample(field, latents.centres, PARAMETERS)
+    assert len(latents.coords) > 2 * MOST_VOXELS
     assert [thinning(n) for n in (1, MOST_VOXELS, MOST_VOXELS + 1)] == [1, 1, 2]
 
     def judged() -> tuple[Ambiguity, np.ndarray]:
-        ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+        ambiguity = measure_ambiguity(field, latents, alignment, annotation, PARAMETERS)
         return ambiguity, surroundings_of(field, latents, alignment, annotation).tied
 
     some = judged()
@@ -97,17 +90,12 @@ def test_a_full_slat_is_judged_by_some_of_its_voxels_and_ties(
     assert abs(some[1].mean() - every[1].mean()) < 0.05
 
 
-def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(monkeypatch):
     """Classes repeat every eight layers, as would steps of eight in a grid that is in order."""
     full = np.ones((64, 64, 64), dtype=bool)
     field = field_of(full, np.where(GRID[..., 2] % 8 == 0, 1, 3))
-    coords = np.argwhere(full).astype(np.uint8)
-    latents = StructuredLatents(coords, np.zeros((len(coords), 8), np.float32))
-    upside_down = Placement(np.diag([-1.0, 1.0, -1.0, 1.0]), 1.0, 20.0)
-    alignment = replace(align(field, latents, AlignParameters()), placements=(upside_down,))
-    annotation = sample(field, map_of(alignment).places(coords), SampleParameters())
+    latents = latents_of(np.argwhere(full))
+    annotation = sample(field, latents.centres, PARAMETERS)
     looked: list[int] = []
 
     def counted(field: MaterialField, places: np.ndarray, *rest: Any, **options: Any) -> Annotation:
@@ -115,7 +103,8 @@ def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(
         return sample(field, places, *rest, **options)
 
     monkeypatch.setattr("slatprep.judge.ambiguity.sample", counted)
-    some = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+    upside_down = aligned(np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0]))
+    some = measure_ambiguity(field, latents, upside_down, annotation, PARAMETERS)
     # Layers 0, 8, 16... change with layers 7, 15, 23...: two of eight.
     assert some.material_share == pytest.approx(0.25, abs=0.01)
     assert looked == [pytest.approx(MOST_VOXELS / FEWER, rel=0.05)]
@@ -133,15 +122,12 @@ def test_without_classes_a_property_that_changes_notably_counts_by_hand() -> Non
     powers = dict(zip([30, 31, 32, 33, 40], [5.0, 5.45, 5.5, 6.0, 5.0], strict=True))
     properties = np.full((len(field.voxels), 3), [1e5, 1e3, 0.3], dtype=np.float32)
     properties[:, 0] = [10.0 ** powers[int(x)] for x in field.voxels[:, 0]]
-    field = replace(
-        field, properties=properties, classified=False, material=np.zeros_like(field.material)
-    )
-    latents = StructuredLatents(field.voxels, np.zeros((len(field.voxels), 8), np.float32))
-    half_a_turn = Placement(np.diag([-1.0, -1.0, 1.0, 1.0]), 1.0, 20.0)
-    found = align(field_of(chair()), surface_latents(chair()), AlignParameters())
-    alignment = replace(found, transform=np.eye(4), placements=(half_a_turn,))
-    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-    ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+    nothing = np.zeros_like(field.material)
+    field = replace(field, properties=properties, classified=False, material=nothing)
+    latents = latents_of(field.voxels)
+    half_a_turn = aligned(np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]))
+    annotation = sample(field, latents.centres, PARAMETERS)
+    ambiguity = measure_ambiguity(field, latents, half_a_turn, annotation, PARAMETERS)
     assert ambiguity.material_share == pytest.approx((4 + 2) / 10)
     expected = ((1 + 0.05 + 0.05 + 1) / 4, 0.0, 0.0)
     np.testing.assert_allclose(ambiguity.property_change, expected, atol=1e-6)

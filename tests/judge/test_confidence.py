@@ -3,11 +3,11 @@
 import math
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.shapes import GRID, chair, field_of, surface_latents
+from test_decoys import OF_PLACEMENT, USUAL
 
 from slatprep.align import align
 from slatprep.align.figures import measure_figures
@@ -52,6 +52,7 @@ from slatprep.sample import sample
 
 Case = tuple[MaterialField, StructuredLatents, Truth]
 Judged = tuple[Judgement, np.ndarray, Annotation]
+OfAChair = tuple[MaterialField, StructuredLatents, Alignment, Annotation]
 
 SPEAK_FOR = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2",
              "within_3", "margin", "clear_by", "fitness", "fitness_backward", "valid_share",
@@ -59,20 +60,7 @@ SPEAK_FOR = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "
              "slat_within_15", "pixieverse_within_half", "pixieverse_within_1",
              "pixieverse_within_15"}  # fmt: skip
 
-OF_PLACEMENT = {"margin", "clear_by", "ties", "alike"}
-
 MODELS = {"same object": SAME_OBJECT, "right placement": PLACEMENT}
-
-
-def _usual(name: str) -> float:
-    """Return a figure's mean over right placements, or the end next to it that counts."""
-    model = PLACEMENT if name in OF_PLACEMENT else SAME_OBJECT
-    own = [figure for figure in model.figures if figure.name == name]
-    inside = [figure.usual for figure in own if figure.low < figure.usual < figure.high]
-    return (*inside, *(figure.usual for figure in own), 0.0)[0]
-
-
-USUAL = np.array([_usual(name) for name in FIGURES])
 
 
 def _judged(field: MaterialField, latents: StructuredLatents) -> Judged:
@@ -91,11 +79,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
         pixieverse=PixieverseSource(root=root / "pixieverse"), slat=SlatSource(root=root / "slat")
     )
     return [
-        (
-            read_field(pair),
-            read_latents(pair),
-            read_truth(Path(root / "truth" / f"{pair.asset_id}.npz")),
-        )
+        (read_field(pair), read_latents(pair), read_truth(root / "truth" / f"{pair.asset_id}.npz"))
         for pair in discover(parameters)
     ]
 
@@ -105,52 +89,51 @@ def judged(cases: list[Case]) -> list[Judged]:
     return [_judged(field, latents) for field, latents, _ in cases]
 
 
+def shares_right(likely: list[np.ndarray], right: list[np.ndarray]) -> list[np.floating]:
+    """Hold that so many voxels of assets are right; return the shares by quarters, surest last."""
+    assert len(likely) >= 5
+    said, so = np.concatenate(likely), np.concatenate(right)
+    assert abs(said.mean() - so.mean()) < 0.05
+    order = np.argsort(said, kind="stable")
+    return [so[part].mean() for part in np.array_split(order, 4)]
+
+
 def test_labels_are_right_as_often_as_they_are_said_to_be(
     cases: list[Case], judged: list[Judged]
 ) -> None:
-    # One coin decides about all voxels of an asset whose ties differ in class.
-    settled = [
-        (truth, own, annotation)
-        for (_, _, truth), (judgement, own, annotation) in zip(cases, judged, strict=True)
-        if judgement.ambiguity.material_share == 0
-    ]
-    assert len(settled) >= 5
-    likely = np.concatenate([own[a.valid] for _, own, a in settled])
-    right = np.concatenate([(a.material == t.material)[a.valid] for t, _, a in settled])
-    assert abs(likely.mean() - right.mean()) < 0.05
-    # Voxels that are said to be surer are right more often.
-    order = np.argsort(likely, kind="stable")
-    shares = [right[part].mean() for part in np.array_split(order, 4)]
+    said, right = [], []
+    for (_, _, truth), (judgement, likely, annotation) in zip(cases, judged, strict=True):
+        valid = annotation.valid
+        # One coin decides about all voxels of an asset whose ties differ in class.
+        if judgement.ambiguity.material_share == 0:
+            said.append(likely[valid])
+            right.append((annotation.material == truth.material)[valid])
+        assert judgement.expected_accuracy == pytest.approx(likely[valid].mean(), abs=1e-6)
+        assert 0.0 < judgement.confidence < 1.0
+        assert likely.dtype == np.float32 and (likely[~valid] == 0).all()
+        assert ((likely[valid] > 0) & (likely[valid] < 1)).all()
+    shares = shares_right(said, right)
     assert shares[0] < shares[-1] and shares[-1] > 0.97
-    for judgement, own, annotation in judged:
-        assert judgement.expected_accuracy == pytest.approx(own[annotation.valid].mean(), abs=1e-6)
 
 
 def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases: list[Case]) -> None:
     # Of the same objects, as a source without classes has them: the same values, all of class 0.
-    likely, right = [], []
+    said, right = [], []
     for field, latents, truth in cases:
         plain = replace(field, material=np.zeros_like(field.material), classified=False)
         judgement, own, annotation = _judged(plain, latents)
         if judgement.ambiguity.material_share > 0:
             continue
         with np.load(truth.path) as file:
-            true = file["properties"]
-        same = np.isclose(annotation.properties, true, rtol=0.01).all(axis=1)
-        likely.append(own[annotation.valid])
+            same = np.isclose(annotation.properties, file["properties"], rtol=0.01).all(axis=1)
+        said.append(own[annotation.valid])
         right.append(same[annotation.valid])
-        assert judgement.expected_accuracy == pytest.approx(likely[-1].mean(), abs=1e-6)
-    assert len(likely) >= 5
-    said, so = np.concatenate(likely), np.concatenate(right)
-    assert abs(said.mean() - so.mean()) < 0.05
-    order = np.argsort(said, kind="stable")
-    shares = [so[part].mean() for part in np.array_split(order, 4)]
+        assert judgement.expected_accuracy == pytest.approx(said[-1].mean(), abs=1e-6)
+    shares = shares_right(said, right)
     assert shares[0] < 0.95 < shares[-1]
 
 
-def test_properties_that_differ_little_are_one_label(
-    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
-) -> None:
+def test_properties_that_differ_little_are_one_label(of_a_chair: OfAChair) -> None:
     field, latents, alignment, annotation = of_a_chair
     plain = replace(field, material=np.zeros_like(field.material), classified=False)
     by_value = voxel_confidence(plain, latents, alignment, annotation, 0.9)
@@ -164,7 +147,7 @@ def test_properties_that_differ_little_are_one_label(
 
 
 def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(
-    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
+    of_a_chair: OfAChair,
 ) -> None:
     field, _, _, annotation = of_a_chair
     rng = np.random.default_rng(0)
@@ -201,14 +184,6 @@ def test_own_objects_pass_and_other_objects_fail(cases: list[Case], judged: list
         assert judgement.reasons
 
 
-def test_probabilities_are_bounded_and_zero_where_not_valid(judged: list[Judged]) -> None:
-    for judgement, likely, annotation in judged:
-        assert 0.0 < judgement.confidence < 1.0
-        assert likely.dtype == np.float32
-        assert (likely[~annotation.valid] == 0).all()
-        assert ((likely[annotation.valid] > 0) & (likely[annotation.valid] < 1)).all()
-
-
 def test_the_same_input_gives_the_same_bytes(cases: list[Case], judged: list[Judged]) -> None:
     judgement, likely, _ = _judged(*cases[1][:2])
     assert repr(judgement) == repr(judged[1][0])  # as two NaN are not equal
@@ -234,8 +209,8 @@ def test_a_better_figure_never_lowers_confidence(asked: str, name: str) -> None:
 
 def test_each_question_has_figures_of_its_own() -> None:
     looked_at = {name: {figure.name for figure in model.figures} for name, model in MODELS.items()}
-    assert looked_at["right placement"] <= OF_PLACEMENT
-    assert not looked_at["same object"] & OF_PLACEMENT
+    assert looked_at["right placement"] <= set(OF_PLACEMENT)
+    assert not looked_at["same object"] & set(OF_PLACEMENT)
     assert all(looked_at.values())
 
 
@@ -254,7 +229,7 @@ def test_a_figure_that_is_not_known_adds_nothing() -> None:
 
 
 @pytest.fixture(scope="module")
-def of_a_chair() -> tuple[MaterialField, StructuredLatents, Alignment, Annotation]:
+def of_a_chair() -> OfAChair:
     solid = chair()
     field, latents = field_of(solid, np.where(GRID[..., 2] < 32, 1, 3)), surface_latents(solid)
     alignment = align(field, latents, AlignParameters())
@@ -262,9 +237,7 @@ def of_a_chair() -> tuple[MaterialField, StructuredLatents, Alignment, Annotatio
     return field, latents, alignment, annotation
 
 
-def test_any_engine_is_judged_by_the_same_figures(
-    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
-) -> None:
+def test_any_engine_is_judged_by_the_same_figures(of_a_chair: OfAChair) -> None:
     field, latents, alignment, annotation = of_a_chair
     around = surroundings_of(field, latents, alignment, annotation)
     own = evidence_of(field, latents, alignment, annotation, around, 0.0)
@@ -274,9 +247,7 @@ def test_any_engine_is_judged_by_the_same_figures(
     assert measure_figures(field, latents, bare).score_slat > 0.9
 
 
-def test_doubt_is_where_the_border_is(
-    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
-) -> None:
+def test_doubt_is_where_the_border_is(of_a_chair: OfAChair) -> None:
     field, latents, alignment, annotation = of_a_chair
     likely = voxel_confidence(field, latents, alignment, annotation, 0.9)
     height = np.abs(latents.coords[:, 2] - 31.5)
@@ -285,9 +256,7 @@ def test_doubt_is_where_the_border_is(
     assert (unsure <= likely).all() and unsure.mean() < likely.mean()
 
 
-def test_a_turned_placement_is_no_longer_sure(
-    of_a_chair: tuple[MaterialField, StructuredLatents, Alignment, Annotation],
-) -> None:
+def test_a_turned_placement_is_no_longer_sure(of_a_chair: OfAChair) -> None:
     field, latents, alignment, _ = of_a_chair
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     wrong = replace(alignment, transform=half_turn @ alignment.transform, figures=None)
@@ -297,9 +266,17 @@ def test_a_turned_placement_is_no_longer_sure(
     assert judgement.confidence < THRESHOLDS.failed_confidence
 
 
-def test_what_takes_confidence_away_is_named() -> None:
-    assert set(causes_of_doubt(USUAL)) == {"shape", "roughness"}
+def test_what_takes_confidence_away_is_summed_by_cause_largest_first() -> None:
     assert all(taken == 0 for taken in causes_of_doubt(USUAL).values())
     bent = USUAL.copy()
     bent[FIGURES.index("bending")] = 1.0
     assert next(iter(causes_of_doubt(bent))) == "shape"
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        figures = USUAL * rng.uniform(0.3, 1.7, len(FIGURES))
+        taken = causes_of_doubt(figures)
+        # Every figure belongs to one cause, and what adds confidence makes up for nothing.
+        added = SAME_OBJECT.contributions(figures)
+        assert sum(taken.values()) == pytest.approx(-added[added < 0].sum())
+        assert set(taken) == {"shape", "roughness"}
+        assert list(taken.values()) == sorted(taken.values(), reverse=True)

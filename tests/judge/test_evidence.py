@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.shapes import GRID, field_of, latents_of, surface_latents
+from support.shapes import GRID, aligned, annotated, field_of, latents_of, surface_latents
 
 from slatprep.align.figures import measure_figures
 from slatprep.geometry.frames import make_transform
@@ -26,15 +26,11 @@ from slatprep.records import (
     Annotation,
     Consensus,
     Deformation,
-    Engine,
     FitFigures,
     Ground,
     MaterialField,
-    Model,
-    Placement,
     Property,
     Quality,
-    Search,
     StructuredLatents,
 )
 
@@ -42,45 +38,18 @@ UPSIDE_DOWN = np.diag([-1.0, 1.0, -1.0, 1.0])
 FAR_OFF = make_transform(np.eye(3), [0.5, 0.5, 0.5])
 
 FIT = FitFigures(
-    score_slat=0.81,
-    score_pixieverse=0.72,
-    score_similarity=0.63,
-    evidence_affine=math.nan,
-    evidence_deformable=math.nan,
-    within=(0.4, 0.5, 0.6),
-    offset=-0.3,
-    roughness=0.7,
-    moved=1.5,
-    moved_most=4.0,
-    stretch=(0.7, 1.2),
-    bending=0.01,
-    clear_by=1.9,
+    score_slat=0.81, score_pixieverse=0.72, score_similarity=0.63,
+    evidence_affine=math.nan, evidence_deformable=math.nan,
+    within=(0.4, 0.5, 0.6), offset=-0.3, roughness=0.7,
+    moved=1.5, moved_most=4.0, stretch=(0.7, 1.2), bending=0.01, clear_by=1.9,
     agreement=Agreement(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6)),
-)
+)  # fmt: skip
 
 
-def aligned(transform: np.ndarray | None = None, *ties: np.ndarray) -> Alignment:
-    return Alignment(
-        np.eye(4) if transform is None else transform,
-        Engine.FIELD,
-        Model.SIMILARITY,
-        Search.EULER64,
-        Quality(0.9, 0.5, 0.8, 0.5, 0.7, 1.0),
-        margin=0.2,
-        placements=tuple(Placement(tie, 1.0, 9.0) for tie in ties),
-        figures=FIT,
-    )
-
-
-def annotated(material: np.ndarray, place: np.ndarray, distance: object = 0.0) -> Annotation:
-    count = len(material)
-    return Annotation(
-        np.ones((count, 3), np.float32),
-        material.astype(np.uint8),
-        material < 255,
-        np.broadcast_to(np.float32(distance), count),
-        place.astype(np.float32),
-    )
+def fitted(transform: np.ndarray | None = None, *ties: np.ndarray) -> Alignment:
+    quality = Quality(0.9, 0.5, 0.8, 0.5, 0.7, 1.0)
+    first = np.eye(4) if transform is None else transform
+    return aligned(first, *ties, quality=quality, margin=0.2, figures=FIT)
 
 
 def column(painted: int) -> tuple[MaterialField, StructuredLatents, Annotation]:
@@ -107,61 +76,40 @@ AROUND = Surroundings(
 def figures(alignment: Alignment, ambiguity: float) -> dict[str, float]:
     field, latents, _ = column(5)
     material = np.array([1, 1, 1, 255])
-    annotation = annotated(material, np.zeros((4, 3)), np.array([0.0, 1.0, 2.0, 9.0]))
+    annotation = annotated(material, distance=np.array([0.0, 1.0, 2.0, 9.0], np.float32))
     found = evidence_of(field, latents, alignment, annotation, AROUND, ambiguity)
     return dict(zip(FIGURES, found.tolist(), strict=True))
 
 
 def test_each_figure_by_hand() -> None:
-    scaled = aligned(make_transform(np.eye(3), scale=0.8), UPSIDE_DOWN, FAR_OFF)
-    assert figures(scaled, 0.3) == pytest.approx(
-        {
-            "score_slat": 0.81,
-            "score_pixieverse": 0.72,
-            "score_similarity": 0.63,
-            "within_1": 0.4,
-            "within_2": 0.5,
-            "within_3": 0.6,
-            "moved": 1.5,
-            "moved_most": 4.0,
-            "bending": 0.01,
-            "stretch": -math.log(0.7),  # farther from one than 1.2
-            "scale": -math.log(0.8),
-            "offset": 0.3,
-            "margin": 0.2,
-            "clear_by": 1.9,
-            "ties": math.log(3),
-            "fitness": 0.9,
-            "fitness_backward": 0.8,
-            "valid_share": 0.75,
-            "distance": (0 + 1 + 2 + 5) / 4,  # beyond five voxels it says no more
-            "depth": math.sqrt((0.3**2 + 0.1**2) / 2),  # -0.3, -0.1, 0.1 and 0.3
-            "alike": 0.0,
-            "ground": 0.0,
-            "directions_near": 0.2,
-            "directions_middle": 0.3,
-            "directions_worst": 0.4,
-            "blocks_near": 0.5,
-            "blocks_middle": 0.6,
-            "blocks_far": 0.7,
-            "slat_within_half": 0.1,
-            "slat_within_1": 0.2,
-            "slat_within_15": 0.3,
-            "pixieverse_within_half": 0.4,
-            "pixieverse_within_1": 0.5,
-            "pixieverse_within_15": 0.6,
-        }
-    )
+    scaled = fitted(make_transform(np.eye(3), scale=0.8), UPSIDE_DOWN, FAR_OFF)
+    expected = {
+        "score_slat": 0.81, "score_pixieverse": 0.72, "score_similarity": 0.63,
+        "within_1": 0.4, "within_2": 0.5, "within_3": 0.6,
+        "moved": 1.5, "moved_most": 4.0, "bending": 0.01,
+        "stretch": -math.log(0.7),  # farther from one than 1.2
+        "scale": -math.log(0.8), "offset": 0.3,
+        "margin": 0.2, "clear_by": 1.9, "ties": math.log(3),
+        "fitness": 0.9, "fitness_backward": 0.8, "valid_share": 0.75,
+        "distance": (0 + 1 + 2 + 5) / 4,  # beyond five voxels it says no more
+        "depth": math.sqrt((0.3**2 + 0.1**2) / 2),  # -0.3, -0.1, 0.1 and 0.3
+        "alike": 0.0, "ground": 0.0,
+        "directions_near": 0.2, "directions_middle": 0.3, "directions_worst": 0.4,
+        "blocks_near": 0.5, "blocks_middle": 0.6, "blocks_far": 0.7,
+        "slat_within_half": 0.1, "slat_within_1": 0.2, "slat_within_15": 0.3,
+        "pixieverse_within_half": 0.4, "pixieverse_within_1": 0.5, "pixieverse_within_15": 0.6,
+    }  # fmt: skip
+    assert figures(scaled, 0.3) == pytest.approx(expected)
 
 
 def test_what_was_not_measured_of_the_agreement_is_not_known() -> None:
-    older = replace(aligned(), figures=replace(FIT, agreement=None))
+    older = replace(fitted(), figures=replace(FIT, agreement=None))
     unknown = [name for name, value in figures(older, 0.0).items() if math.isnan(value)]
     assert unknown == list(FIGURES[-12:])
 
 
 def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose() -> None:
-    tied = aligned(None, UPSIDE_DOWN)
+    tied = fitted(None, UPSIDE_DOWN)
     several = figures(tied, HARMLESS + 0.001)
     assert (several["margin"], several["alike"]) == (0.2, 0.0)
     assert several["ties"] == pytest.approx(math.log(2))
@@ -171,9 +119,9 @@ def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose() 
         assert math.isnan(one["margin"]) and math.isnan(one["clear_by"])
         assert (one["ties"], one["alike"]) == (0.0, 1.0)
     # Without ties the margin says how far behind the next placement is, up to a limit.
-    assert figures(aligned(), 0.0)["margin"] == 0.2
-    assert figures(replace(aligned(), margin=0.5), 0.0)["margin"] == 0.3
-    on_ground = replace(aligned(), ground=Ground(np.array([0.0, 0.0, 1.0]), -0.2))
+    assert figures(fitted(), 0.0)["margin"] == 0.2
+    assert figures(replace(fitted(), margin=0.5), 0.0)["margin"] == 0.3
+    on_ground = replace(fitted(), ground=Ground(np.array([0.0, 0.0, 1.0]), -0.2))
     assert figures(on_ground, 0.0)["ground"] == 1.0
 
 
@@ -184,7 +132,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
     voxels = np.array([[32, 32, 31], [32, 32, 29], [32, 32, 10], [32, 32, 1]])
     latents = latents_of(voxels)
     annotation = annotated(np.array([1, 1, 1, 255]), latents.centres)
-    around = surroundings_of(field, latents, aligned(), annotation)
+    around = surroundings_of(field, latents, fitted(), annotation)
     # Of 14 cells one and four lie above: 1, 2, 4 and 7 voxels along the axis, and 1, 1, 2 and 4
     # along the diagonals of space.
     above = np.array([[5, 5, 5, 5], [0, 0, 1, 5], [0, 0, 0, 0]]) / 14
@@ -199,50 +147,42 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
 def test_how_far_a_deformation_moves_is_measured_in_the_frame_of_the_annotation() -> None:
     field, latents, annotation = column(5)
     pushed = Deformation(np.eye(3, 4), np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)))
-    alignment = replace(aligned(make_transform(np.eye(3), scale=0.5)), deformation=pushed)
+    alignment = replace(fitted(make_transform(np.eye(3), scale=0.5)), deformation=pushed)
     steps = np.linspace(0.0, 3.0, len(latents.coords))
     place = 2.0 * latents.centres + steps[:, None] * np.array([0.6, 0.0, 0.8]) / 64
     around = surroundings_of(field, latents, alignment, replace(annotation, place=place))
     np.testing.assert_allclose(around.moved, steps, atol=1e-4)
 
 
-def test_ties_count_by_how_many_of_them_change_the_class() -> None:
+@pytest.mark.parametrize(("most", "ties", "share"), [
+    (99, [UPSIDE_DOWN], 1 / 2),  # of the chosen one and one more
+    (99, [UPSIDE_DOWN, UPSIDE_DOWN], 2 / 3),
+    (99, [UPSIDE_DOWN, np.eye(4)], 1 / 3),
+    (99, [UPSIDE_DOWN, FAR_OFF], 1 / 3),  # where nothing is annotated nothing contradicts
+    # Of many voxels, here 40, some ties stand for all: every second one.
+    (20, [UPSIDE_DOWN] * 3, 3 / 4),
+    (20, [UPSIDE_DOWN, np.eye(4), np.eye(4)], (3 / 2) / 4),
+    (20, [UPSIDE_DOWN, np.eye(4), UPSIDE_DOWN], 3 / 4),
+])  # fmt: skip
+def test_ties_count_by_how_many_of_them_change_the_class(most, ties, share, monkeypatch):
+    monkeypatch.setattr("slatprep.judge.ambiguity.MOST_VOXELS", most)
     field, latents, annotation = column(5)
     # Turned upside down the five lower and the five upper of twenty layers change classes.
     changes = np.isin(latents.coords[:, 2], [*range(22, 27), *range(37, 42)])
-    for ties, share in (
-        ([UPSIDE_DOWN], 1 / 2),  # of the chosen one and one more
-        ([UPSIDE_DOWN, UPSIDE_DOWN], 2 / 3),
-        ([UPSIDE_DOWN, np.eye(4)], 1 / 3),
-        ([UPSIDE_DOWN, FAR_OFF], 1 / 3),  # where nothing is annotated nothing contradicts
-    ):
-        tied = surroundings_of(field, latents, aligned(None, *ties), annotation).tied
-        np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
-    settled = replace(aligned(None, UPSIDE_DOWN), settled_by=Consensus(np.eye(3), 5, 5))
+    tied = surroundings_of(field, latents, fitted(None, *ties), annotation).tied
+    np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
+    settled = replace(fitted(None, *ties), settled_by=Consensus(np.eye(3), 5, 5))
     assert not surroundings_of(field, latents, settled, annotation).tied.any()
 
 
 def test_ties_that_change_few_classes_count_as_one() -> None:
     # Of 40 voxels in 20 layers four change by a painted layer, by a half each.
     field, latents, annotation = column(2)
-    tied = surroundings_of(field, latents, aligned(None, UPSIDE_DOWN), annotation).tied
+    tied = surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied
     assert tied.mean() == pytest.approx(8 / 40 / 2)
     one = np.where(np.arange(40) == 0, 3, 1).astype(np.uint8)  # two voxels change: 2 / 40 / 2
     field, annotation = replace(field, material=one), replace(annotation, material=one)
-    assert not surroundings_of(field, latents, aligned(None, UPSIDE_DOWN), annotation).tied.any()
-
-
-def test_of_many_voxels_some_ties_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    field, latents, annotation = column(5)
-    changes = np.isin(latents.coords[:, 2], [*range(22, 27), *range(37, 42)])
-    monkeypatch.setattr("slatprep.judge.ambiguity.MOST_VOXELS", 20)  # of 40: every second tie
-    for ties, share in (
-        ([UPSIDE_DOWN] * 3, 3 / 4),
-        ([UPSIDE_DOWN, np.eye(4), np.eye(4)], (3 / 2) / 4),
-        ([UPSIDE_DOWN, np.eye(4), UPSIDE_DOWN], 3 / 4),
-    ):
-        tied = surroundings_of(field, latents, aligned(None, *ties), annotation).tied
-        np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
+    assert not surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied.any()
 
 
 def plain_field(values: np.ndarray) -> MaterialField:
@@ -259,14 +199,8 @@ def plain_field(values: np.ndarray) -> MaterialField:
 
 def as_annotation(field: MaterialField, rows: np.ndarray) -> Annotation:
     """Return an annotation that shows rows of a field; -1 for none."""
-    valid = rows >= 0
-    return Annotation(
-        np.where(valid[:, None], field.properties[rows], np.nan).astype(np.float32),
-        np.where(valid, 0, 255).astype(np.uint8),
-        valid,
-        np.zeros(len(rows), np.float32),
-        np.zeros((len(rows), 3), np.float32),
-    )
+    shown = np.where(rows[:, None] >= 0, field.properties[rows], np.nan).astype(np.float32)
+    return annotated(np.where(rows >= 0, 0, 255), properties=shown)
 
 
 @pytest.mark.parametrize(("properties", "parts"), [(1, 10), (2, 10), (3, 5), (4, 2.5)])
@@ -344,13 +278,13 @@ def ball(radius: float, at: float = 31.5) -> np.ndarray:
 def test_an_engine_without_figures_has_a_larger_ball_s_offset() -> None:
     for larger in (1.0, -1.0):
         field, latents = field_of(ball(18.0 + larger)), surface_latents(ball(18.0))
-        found = measure_figures(field, latents, aligned())
+        found = measure_figures(field, latents, fitted())
         # At the SLAT's surface the other one's is that much farther out.
         assert found.offset == pytest.approx(-larger, abs=0.1)
         assert min(found.score_slat, found.score_pixieverse, *found.within) > 0.9
         assert found.roughness < 0.3
     # No more than two voxels are taken for an offset.
-    found = measure_figures(field_of(ball(21.0)), surface_latents(ball(18.0)), aligned())
+    found = measure_figures(field_of(ball(21.0)), surface_latents(ball(18.0)), fitted())
     assert found.offset == -2.0
     assert found.within[0] > 0.4 and found.roughness == pytest.approx(1.0, abs=0.2)
 
@@ -358,7 +292,7 @@ def test_an_engine_without_figures_has_a_larger_ball_s_offset() -> None:
 def test_an_engine_without_figures_has_those_of_a_shifted_ball() -> None:
     """Archimedes: heights on a sphere are even; from each follows how far off the other one is."""
     field, latents = field_of(ball(18.0)), surface_latents(ball(18.0, 35.5))
-    found = measure_figures(field, latents, aligned())
+    found = measure_figures(field, latents, fitted())
     height = np.linspace(-1.0, 1.0, 100_001)
     apart = np.abs(np.sqrt(18.0**2 + 4.0**2 - 2 * 18.0 * 4.0 * height) - 18.0)
     assert found.offset == pytest.approx(0.0, abs=0.25)
@@ -370,7 +304,7 @@ def test_an_engine_without_figures_has_those_of_a_shifted_ball() -> None:
     assert found.score_pixieverse == pytest.approx(mean, abs=0.08)
     assert found.score_similarity == 0.5 * (found.score_slat + found.score_pixieverse)
     there = make_transform(np.eye(3), [4 / 64, 0, 0])
-    assert measure_figures(field, latents, aligned(there)).within[0] > 0.98
+    assert measure_figures(field, latents, fitted(there)).within[0] > 0.98
 
 
 def test_figures_of_a_voxel_by_hand() -> None:

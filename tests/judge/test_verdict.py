@@ -5,27 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.shapes import field_of, latents_of
+from support.shapes import aligned, annotated, field_of, latents_of
 
 from slatprep.judge import THRESHOLDS, judge, verdict_of
-from slatprep.judge.calibration import SAME_OBJECT
-from slatprep.judge.confidence import causes_of_doubt
-from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import contradicted, merged
 from slatprep.parameters import SampleParameters
-from slatprep.records import (
-    Alignment,
-    Ambiguity,
-    Annotation,
-    Engine,
-    FitFigures,
-    Judgement,
-    Model,
-    Placement,
-    Quality,
-    Search,
-    Verdict,
-)
+from slatprep.records import Ambiguity, Annotation, FitFigures, Judgement, Quality, Verdict
 
 FINE = Quality(1.0, 0.5, 1.0, 0.5, 1.0, 1.0)
 ROUGH = Quality(0.7, 0.5, 0.6, 0.5, 0.7, 1.5)
@@ -35,29 +20,18 @@ def judgement(verdict: Verdict, expected: float) -> Judgement:
     return Judgement(Ambiguity(0.0, (0.0,)), verdict, ("what it had",), 0.95, expected)
 
 
-def annotation(confidence: list[float] | None, valid: list[bool]) -> Annotation:
-    count = len(valid)
-    return Annotation(
-        np.ones((count, 3), np.float32),
-        np.where(valid, 1, 255).astype(np.uint8),
-        np.array(valid),
-        np.zeros(count, np.float32),
-        np.zeros((count, 3), np.float32),
-        None if confidence is None else np.array(confidence, np.float32),
-    )
+def annotation(likely: list[float] | None, unlabelled: int = 0) -> Annotation:
+    """Return an annotation whose labels are that likely, and that many voxels without one."""
+    classes = np.repeat([1, 255], [len(likely or ()), unlabelled])
+    confidence = np.array([*(likely or ()), *[0.0] * unlabelled], np.float32)
+    return annotated(classes, confidence=None if likely is None else confidence)
 
 
 def test_an_asset_on_every_limit_is_good_for_no_reason() -> None:
-    limits = THRESHOLDS
-    assert verdict_of(
-        FINE,
-        limits.good_valid_share,
-        limits.good_ambiguity,
-        3,
-        limits.good_confidence,
-        1.0,
-        limits.good_accuracy,
-    ) == (Verdict.GOOD, ())
+    least = THRESHOLDS
+    shares = least.good_valid_share, least.good_ambiguity
+    given = verdict_of(FINE, *shares, 3, least.good_confidence, 1.0, least.good_accuracy)
+    assert given == (Verdict.GOOD, ())
     # Where object and placement are sure, the fitness does not matter.
     assert verdict_of(ROUGH, 1.0, same_object=0.96, right_placement=0.95) == (Verdict.GOOD, ())
 
@@ -74,12 +48,10 @@ def test_every_reason_is_named_once() -> None:
     assert verdict is Verdict.DOUBTFUL
     assert reasons == (
         "perhaps another object: the two sides show the same one with a probability of 60.0% "
-        "(good needs 90% for object and placement together): the surfaces lie on each "
-        "other roughly "
-        "only",
-        "perhaps a wrong placement: it is right with a probability of 80.0% (good needs "
-        "90% for object "
-        "and placement together)",
+        "(good needs 90% for object and placement together): the surfaces lie on each other "
+        "roughly only",
+        "perhaps a wrong placement: it is right with a probability of 80.0% (good needs 90% for "
+        "object and placement together)",
         "only 70.0% of the PixieVerse boundary lies within 1.5 voxel of the other side "
         "(good needs 80%)",
         "only 60.0% of the SLAT boundary lies within 1.5 voxel of the other side (good needs 80%)",
@@ -152,22 +124,14 @@ def test_a_placement_that_ties_is_not_failed(ties: int, ambiguity: float, verdic
     assert verdict_of(FINE, 1.0, ambiguity, ties, 0.2, 1.0)[0] is Verdict.FAILED
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        (Verdict.GOOD, Verdict.DOUBTFUL),
-        (Verdict.DOUBTFUL, Verdict.DOUBTFUL),
-        (Verdict.FAILED, Verdict.FAILED),
-    ],
-)
-def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(
-    before: Verdict, after: Verdict
-) -> None:
+@pytest.mark.parametrize("before", Verdict)
+def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(before: Verdict) -> None:
+    after = Verdict.DOUBTFUL if before is Verdict.GOOD else before
     against = contradicted(judgement(before, 0.9))
     assert (against.verdict, against.contradicted) == (after, True)
     assert against.reasons[0] == "what it had"
     assert "contradict its labels" in against.reasons[1]
-    several = merged(judgement(before, 0.9), annotation([0.5, 0.5, 0.0], [True, True, False]))
+    several = merged(judgement(before, 0.9), annotation([0.5, 0.5], 1))
     assert (several.verdict, several.expected_accuracy) == (after, 0.5)
     assert several.reasons == (
         "what it had",
@@ -176,45 +140,24 @@ def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(
     )
 
 
-@pytest.mark.parametrize(
-    ("alone", "likely"),
-    [
-        (0.9, [0.75, 0.75]),  # just enough together
-        (0.7, [0.6, 0.6]),  # too little before, which its own reasons tell
-        (0.7, [0.8, 0.9]),
-    ],
-)
+@pytest.mark.parametrize(("alone", "likely"), [
+    (0.9, [0.75, 0.75]),  # just enough together
+    (0.7, [0.6, 0.6]),  # too little before, which its own reasons tell
+    (0.7, [0.8, 0.9]),
+])  # fmt: skip
 def test_samples_that_agree_add_no_reason(alone: float, likely: list[float]) -> None:
     before = judgement(Verdict.GOOD, alone)
-    together = merged(before, annotation(likely, [True, True]))
+    together = merged(before, annotation(likely))
     assert together.expected_accuracy == pytest.approx(np.mean(likely))
     assert replace(together, expected_accuracy=alone) == before
+    just = merged(judgement(Verdict.GOOD, 0.75), annotation([0.5]))
+    assert just.verdict is Verdict.DOUBTFUL
 
 
-def test_samples_that_agree_by_just_enough_before_and_not_together_differ() -> None:
-    several = merged(judgement(Verdict.GOOD, 0.75), annotation([0.5], [True]))
-    assert several.verdict is Verdict.DOUBTFUL
-
-
-@pytest.mark.parametrize("confidence", [None, [0.0, 0.0]])
-def test_samples_without_any_label_are_right_nowhere(confidence: list[float] | None) -> None:
-    several = merged(judgement(Verdict.GOOD, 0.9), annotation(confidence, [False, False]))
+@pytest.mark.parametrize("likely", [None, []])
+def test_samples_without_any_label_are_right_nowhere(likely: list[float] | None) -> None:
+    several = merged(judgement(Verdict.GOOD, 0.9), annotation(likely, 2))
     assert (several.verdict, several.expected_accuracy) == (Verdict.DOUBTFUL, 0.0)
-
-
-def test_what_takes_confidence_away_is_summed_by_cause_largest_first() -> None:
-    own = {figure.name: figure.usual for figure in SAME_OBJECT.figures}
-    usual = np.array([own.get(name, 1.0) for name in FIGURES])
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        figures = usual * rng.uniform(0.3, 1.7, len(FIGURES))
-        added = dict(zip(FIGURES, SAME_OBJECT.contributions(figures).tolist(), strict=True))
-        taken = causes_of_doubt(figures)
-        # Every figure belongs to one cause, and what adds confidence makes up for nothing.
-        lost = [-value for value in added.values() if value < 0]
-        assert sum(taken.values()) == pytest.approx(sum(lost))
-        assert set(taken) == {"shape", "roughness"}
-        assert list(taken.values()) == sorted(taken.values(), reverse=True)
 
 
 def test_a_judgement_has_what_was_measured_of_its_asset() -> None:
@@ -226,18 +169,9 @@ def test_a_judgement_has_what_was_measured_of_its_asset() -> None:
     field = field_of(solid, classes)
     latents = latents_of(field.voxels)
     fit = FitFigures(0.9, 0.9, 0.9, math.nan, math.nan, (0.95, 0.97, 0.99), 0.0, 0.3)
-    swapped = Placement(np.diag([-1.0, -1.0, 1.0, 1.0]), 0.9, 9.0)
-    alignment = Alignment(
-        np.eye(4), Engine.FIELD, Model.RIGID, Search.EULER64, FINE,
-        margin=0.0, placements=(swapped,), figures=fit,
-    )  # fmt: skip
-    sampled = Annotation(
-        field.properties,
-        field.material,
-        np.ones(len(field.voxels), dtype=bool),
-        np.zeros(len(field.voxels), np.float32),
-        latents.centres.astype(np.float32),
-    )
+    swapped = np.diag([-1.0, -1.0, 1.0, 1.0])
+    alignment = aligned(np.eye(4), swapped, quality=FINE, margin=0.0, figures=fit)
+    sampled = annotated(field.material, latents.centres, properties=field.properties)
     found, likely = judge(field, latents, alignment, sampled, SampleParameters())
     assert found.ambiguity.material_share == 1.0
     assert found.verdict is not Verdict.GOOD

@@ -1,6 +1,7 @@
 """Materials reach particles: against brute force, and read back by other programs."""
 
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,7 @@ def write_gaussians(path: Path, slat_positions: np.ndarray) -> np.ndarray:
     """Write Gaussians as TRELLIS does; return the positions that the file has."""
     x, y, z = slat_positions.T
     saved = np.column_stack([x, -z, y])  # [[1, 0, 0], [0, 0, -1], [0, 1, 0]] @ (x, y, z)
-    rows = np.zeros(len(saved), dtype=[(name, "f4") for name in GAUSSIAN])
-    for axis, name in enumerate("xyz"):
-        rows[name] = saved[:, axis]
-    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
+    write_points(path, saved, GAUSSIAN)
     return saved.astype(np.float32)
 
 
@@ -39,11 +37,23 @@ def run(*words: object) -> dict[str, Any]:
     return commands.document("transfer", *words, "-q")
 
 
-def run_wrong(*words: object) -> str:
-    result = commands.run("transfer", *words, code=None)
-    assert result.exit_code in (1, 2), result.output
-    assert len(result.stderr.splitlines()) == 1
-    return result.stderr
+def run_wrong(*words: object, code: int = 2) -> str:
+    told = commands.refused("transfer", *words, code=code)
+    assert len(told.splitlines()) == 1
+    return told
+
+
+def write_points(path: Path, positions: np.ndarray, names: Iterable[str] = "xyz") -> None:
+    """Write a PLY of points with these fields, all others 0."""
+    rows = np.zeros(len(positions), dtype=[(name, "f4") for name in names])
+    rows["x"], rows["y"], rows["z"] = positions.T
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
+
+
+def columns(path: Path, names: Iterable[str]) -> np.ndarray:
+    """Return fields of the points in a PLY, a column for each."""
+    vertex = plyfile.PlyData.read(path)["vertex"]
+    return np.column_stack([vertex[name] for name in names])
 
 
 @pytest.fixture(scope="module")
@@ -75,14 +85,14 @@ def test_gaussians_of_either_tool_get_the_material_of_their_voxel(
     )
     assert ("read as SAM 3D Objects saves them" in told.stderr) == (tool == "sam3d")
 
-    vertex, in_slat = (plyfile.PlyData.read(tmp_path / f"{n}.ply")["vertex"] for n in "ms")
     # Row for row the Gaussians of the file, so that the two lie on each other.
-    np.testing.assert_array_equal(np.column_stack([vertex[a] for a in "xyz"]), saved)
-    np.testing.assert_allclose(np.column_stack([in_slat[a] for a in "xyz"]), positions, atol=1e-7)
+    np.testing.assert_array_equal(columns(tmp_path / "m.ply", "xyz"), saved)
+    np.testing.assert_allclose(columns(tmp_path / "s.ply", "xyz"), positions, atol=1e-7)
     voxel = {tuple(c): m for c, m in zip(coords.tolist(), material.tolist(), strict=True)}
     truth = [voxel[tuple(v)] for v in np.floor((positions + 0.5) * 64).astype(int).tolist()]
-    np.testing.assert_array_equal(vertex["material_id"], truth)
-    hold_truth(*(vertex[name] for name in ("material_id", "E", "density", "nu")))
+    given = columns(tmp_path / "m.ply", ("material_id", "E", "density", "nu")).T
+    np.testing.assert_array_equal(given[0], truth)
+    hold_truth(*given)
 
 
 @pytest.mark.parametrize(("axes", "turn"), [
@@ -138,48 +148,38 @@ def test_axes_that_fit_alike_are_asked_for(shape, tmp_path):
         axes = "trellis" if write is write_gaussians else "slat"
         words = ("--prediction", tmp_path / "two.npz", "--out", out, "--axes", axes)
         run(tmp_path / "g.ply", *words)
-        vertex = plyfile.PlyData.read(out)["vertex"]
-        np.testing.assert_array_equal(vertex["material_id"], positions[:, 2] > 0)
+        given = columns(out, ["material_id"])[:, 0]
+        np.testing.assert_array_equal(given, positions[:, 2] > 0)
         out.unlink()
 
 
-def test_particles_of_another_object_are_an_error_that_says_where_they_lie(store, tmp_path):
-    np.save(tmp_path / "p.npy", np.random.default_rng(0).uniform(2, 3, (500, 3)))
-    said = run_wrong(tmp_path / "p.npy", "--store", store, "--asset", "cup",
-                     "--out", tmp_path / "m.ply")  # fmt: skip
-    assert "500 of 500 particles have no voxel within 2 voxels" in said
-    assert "no other --axes brings them nearer; they lie between 2" in said
-
-
-def test_a_third_of_the_particles_far_is_told(store, true_parts, tmp_path):
+def test_particles_that_are_far_are_told_and_of_another_object_an_error(
+    store, true_parts, tmp_path
+):
     positions = particles_near(true_parts[0], 900, 0.45)
+    np.save(tmp_path / "p.npy", positions + 3.0)
+    words = (tmp_path / "p.npy", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")
+    said = run_wrong(*words)
+    assert "900 of 900 particles have no voxel within 2 voxels" in said
+    assert "no other --axes brings them nearer; they lie between 2" in said
     positions[::3] += 3.0
     np.save(tmp_path / "p.npy", positions)
-    words = ("--store", store, "--asset", "cup", "-q", "--out", tmp_path / "m.ply")
-    told = commands.run("transfer", tmp_path / "p.npy", *words).stderr
-    assert "300 of 900 particles have no voxel" in told
-    assert "read with --axes slat" in told
+    told = commands.run("transfer", *words, "-q").stderr
+    assert "300 of 900 particles have no voxel" in told and "read with --axes slat" in told
 
 
-@pytest.mark.parametrize(
-    ("names", "reach", "sign"),
-    [
-        ([*GAUSSIAN, "f_rest_0"], 0.4, "it has f_rest_*"),
-        ([name for name in GAUSSIAN if name[0] != "n"], 0.4, "it has no normals"),
-        (GAUSSIAN, 3.0, "it reaches 3 from the centre, out of the unit cube"),
-    ],
-)
+@pytest.mark.parametrize(("names", "reach", "sign"), [
+    ([*GAUSSIAN, "f_rest_0"], 0.4, "it has f_rest_*"),
+    ([name for name in GAUSSIAN if name[0] != "n"], 0.4, "it has no normals"),
+    (GAUSSIAN, 3.0, "it reaches 3 from the centre, out of the unit cube"),
+])  # fmt: skip
 def test_gaussians_of_another_tool_are_not_taken_for_trellis(
     names, reach, sign, store, true_parts, tmp_path
 ):
-    rows = np.zeros(400, dtype=[(name, "f4") for name in names])
-    positions = particles_near(true_parts[0], len(rows), 0.45)
-    positions *= reach / abs(positions).max()
-    rows["x"], rows["y"], rows["z"] = positions.T
-    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "g.ply")
+    positions = particles_near(true_parts[0], 400, 0.45)
+    write_points(tmp_path / "g.ply", positions * reach / abs(positions).max(), names)
     read = read_particles(tmp_path / "g.ply")
-    assert read.foreign == sign
-    assert read.axes == "slat"
+    assert (read.foreign, read.axes) == (sign, "slat")
     assert read_particles(tmp_path / "g.ply", "glb").axes == "glb"
 
     words = (tmp_path / "g.ply", "--store", store, "--asset", "cup", "--far", "drop",
@@ -206,7 +206,7 @@ def test_what_slatprep_wrote_says_its_frame(store, true_parts, tmp_path):
         if frame == "slat":
             cloud = tmp_path / frame / "cup.ply"
             assert run(cloud, *words, tmp_path / "m.ply", "--points", points)["far"] == 0
-    said = run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply")
+    said = run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply", code=1)
     assert "in the PixieVerse frame; expected the SLAT frame: slatprep export --frame slat" in said
     run_wrong(tmp_path / "pixieverse" / "cup.ply", *words, tmp_path / "m.ply", "--axes", "slat")
 
@@ -214,13 +214,10 @@ def test_what_slatprep_wrote_says_its_frame(store, true_parts, tmp_path):
 def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path):
     cube = np.argwhere(np.ones((20, 20, 20))) + 20
     shell = cube[((cube == 20) | (cube == 39)).any(axis=1)]
-    np.savez(
-        tmp_path / "p.npz", coords=shell, material=np.zeros(len(shell), int),
-        properties_si=np.tile([1e5, 1e3, 0.3], (len(shell), 1)),
-    )  # fmt: skip
+    write_prediction(tmp_path / "p.npz", shell, np.zeros(len(shell), int))
     np.save(tmp_path / "solid.npy", (cube + 0.5) / 64 - 0.5)
-    said = run_wrong(tmp_path / "solid.npy", "--prediction", tmp_path / "p.npz",
-                     "--out", tmp_path / "m.ply", "--max-distance", "1")  # fmt: skip
+    words = ("--out", tmp_path / "m.ply", "--max-distance", 1)
+    said = run_wrong(tmp_path / "solid.npy", "--prediction", tmp_path / "p.npz", *words)
     # 16^3 of 20^3 are more than a voxel from the shell.
     assert "4,096 of 8,000 particles" in said and "(51%, half of them none within 3)" in said
     assert "100% of them lie inside the object" in said and "--points grid" in said
@@ -228,12 +225,9 @@ def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path):
 
 def test_nearest_is_nearest_by_brute_force():
     rng = np.random.default_rng(1)
-    cells = rng.choice(64**3, size=400, replace=False)
-    voxels = np.stack(np.unravel_index(cells, (64,) * 3), axis=1).astype(np.uint8)
-    modulus = np.arange(400, dtype=np.float32)
-    field = VoxelField(
-        voxels, (cells % 7).astype(np.uint8), np.stack([modulus] * 3, axis=1).astype(np.float32)
-    )
+    voxels = rng.permutation(np.argwhere(np.ones((64,) * 3)))[:400].astype(np.uint8)
+    values = np.tile(np.arange(400, dtype=np.float32)[:, None], 3)
+    field = VoxelField(voxels, (np.arange(400) % 7).astype(np.uint8), values)
     points = rng.uniform(-0.6, 0.6, (700, 3))
     apart = np.linalg.norm(points[:, None] - ((voxels + 0.5) / 64 - 0.5)[None], axis=2) * 64
     result = transfer(points, field, max_distance=6.0, far="nearest")
@@ -257,9 +251,8 @@ def test_grid_reaches_inside_the_object(store, mixed, tmp_path):
     np.save(tmp_path / "solid.npy", (turned + 0.5) / 64 - 0.5)
     words = ("--store", store, "--asset", "cup", "--points", "grid", "--out", tmp_path / "m.ply")
     run(tmp_path / "solid.npy", *words)
-    vertex = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
-    np.testing.assert_array_equal(vertex["material_id"], grid[tuple(solid.T)][:, 3])
-    np.testing.assert_allclose(vertex["E"], grid[tuple(solid.T)][:, 1], rtol=1e-4)
+    given = columns(tmp_path / "m.ply", ("E", "material_id"))
+    np.testing.assert_allclose(given, grid[tuple(solid.T)][:, [1, 3]], rtol=1e-4)
 
 
 def test_prediction_is_transferred_as_the_store_is(store, tmp_path):
@@ -278,25 +271,24 @@ def test_prediction_is_transferred_as_the_store_is(store, tmp_path):
 
 def test_prediction_in_si_needs_no_ranges(tmp_path):
     coords = np.array([[0, 1, 2, 3], [0, 4, 5, 6]], np.int32)
-    properties = np.array([[1e5, 1e3, 0.3], [np.nan] * 3], np.float32)
-    np.savez(tmp_path / "p.npz", coords=coords, properties_si=properties,
-             material=np.array([2, 255]), valid=np.array([True, False]))  # fmt: skip
-    field = predicted_field(tmp_path / "p.npz", None)
+    values = np.array([[1e5, 1e3, 0.3], [np.nan] * 3], np.float32)
+
+    def predicted(**arrays: object) -> VoxelField:
+        np.savez(tmp_path / "p.npz", coords=coords, material=np.array([2, 255]), **arrays)
+        return predicted_field(tmp_path / "p.npz", None)
+
+    field = predicted(properties_si=values, valid=np.array([True, False]))
     np.testing.assert_array_equal(field.voxels, [[1, 2, 3]])
-    np.testing.assert_array_equal(field.properties, properties[:1])
-    np.savez(tmp_path / "n.npz", coords=coords, properties=properties, material=np.array([2, 2]))
+    np.testing.assert_array_equal(field.properties, values[:1])
     with pytest.raises(ConfigError, match="--ranges"):
-        predicted_field(tmp_path / "n.npz", None)
-    np.savez(tmp_path / "w.npz", coords=coords, properties_si=properties, material=np.array([2, 2]))
-    with pytest.raises(InputError, match="row 1 has material 2 and properties"):
-        predicted_field(tmp_path / "w.npz", None)
+        predicted(properties=values)
+    with pytest.raises(InputError, match="row 1 has material 255 and properties"):
+        predicted(properties_si=values)
 
 
 def test_plain_points_are_taken_as_they_lie(tmp_path):
     positions = np.array([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.4]])
-    rows = np.array([tuple(p) for p in positions], dtype=[(a, "f8") for a in "xyz"])
-    element = plyfile.PlyElement.describe(rows, "vertex")
-    plyfile.PlyData([element], text=True).write(tmp_path / "plain.ply")
+    write_points(tmp_path / "plain.ply", positions)
     write_gaussians(tmp_path / "g.ply", positions)
     np.save(tmp_path / "p.npy", positions)
     for name in ("plain.ply", "g.ply", "p.npy"):

@@ -1,12 +1,27 @@
 """Shapes of which everything is known by construction."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of
 from slatprep.inspect.score import Truth
 from slatprep.parameters import SampleParameters
 from slatprep.pipeline.annotate import look_up
-from slatprep.records import Alignment, Judgement, MaterialField, StructuredLatents
+from slatprep.records import (
+    UNANNOTATED,
+    Alignment,
+    Annotation,
+    Engine,
+    Judgement,
+    MaterialField,
+    Model,
+    Placement,
+    Quality,
+    Search,
+    StructuredLatents,
+)
 
 Case = tuple[MaterialField, StructuredLatents, Truth]
 
@@ -33,6 +48,27 @@ def latents_of(voxels: np.ndarray) -> StructuredLatents:
 
 def surface_latents(occupancy: np.ndarray) -> StructuredLatents:
     return latents_of(voxels_of(boundary(occupancy)))
+
+
+def aligned(*tied: np.ndarray, **others: Any) -> Alignment:
+    """Return an alignment by the first of placements that tie, the identity where none is given."""
+    first, *rest = tied or (np.eye(4),)
+    placements = tuple(Placement(one, 1.0, 9.0) for one in rest)
+    how = Engine.FIELD, Model.RIGID, Search.EULER64, Quality(1, 0, 1, 0, 1, 1)
+    return replace(Alignment(first, *how, placements=placements), **others)
+
+
+def annotated(material: np.ndarray, place: np.ndarray | None = None, **others: Any) -> Annotation:
+    """Return an annotation of these classes (N,), 255 for none, looked up at places (N, 3)."""
+    count = len(material)
+    made = Annotation(
+        np.ones((count, 3), np.float32),
+        np.asarray(material).astype(np.uint8),
+        np.asarray(material) < UNANNOTATED,
+        np.zeros(count, np.float32),
+        np.zeros((count, 3), np.float32) if place is None else place.astype(np.float32),
+    )
+    return replace(made, **others)
 
 
 def judged(field: MaterialField, latents: StructuredLatents, alignment: Alignment) -> Judgement:
