@@ -187,10 +187,11 @@ def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[
         import zarr
 
         group = zarr.open_group(root / f"{name}.zarr", mode="w", zarr_format=3)
-        # All chunks: one that is missing later is then known to be lost.
-        whole = {"write_empty_chunks": True}
         for key, array in arrays.items():
-            group.create_array(key, data=np.ascontiguousarray(array), config=whole)
+            # All chunks: one that is missing later is then known to be lost.
+            group.create_array(
+                key, data=np.ascontiguousarray(array), config={"write_empty_chunks": True}
+            )
     else:
         columns = {key: array for key, array in arrays.items() if key != "voxels"}
         points = ((arrays["voxels"] + 0.5) / 64.0 - 0.5).astype(np.float32)

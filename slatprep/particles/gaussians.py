@@ -106,7 +106,7 @@ def _columns(vertices: NDArray[Any], names: Iterable[str]) -> NDArray[np.float64
     return np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
 
 
-def _set_columns(vertices: NDArray[Any], names: Iterable[str], values: NDArray[np.float64]) -> None:
+def _set_columns(vertices: NDArray[Any], names: Iterable[str], values: NDArray[Any]) -> None:
     for name, column in zip(names, values.T, strict=True):
         vertices[name] = column
 
