@@ -14,6 +14,7 @@ from slatprep.normalize import (
     change_ranges,
     denormalize_properties,
     from_mapped,
+    normalization_of,
     normalize_and_count,
     normalize_change,
     normalize_properties,
@@ -22,33 +23,25 @@ from slatprep.normalize import (
     to_mapped,
 )
 from slatprep.readers.ranges import read_ranges
-from slatprep.records import MaterialField, Normalization, PropertyRange
-
-DECADES = Normalization(
-    (
-        PropertyRange("youngs_modulus", True, 4.0, 12.0),
-        PropertyRange("density", True, 2.0, 4.0),
-        PropertyRange("poissons_ratio", False, 0.2, 0.4),
-    ),
-    source="by hand",
-)
+from slatprep.records import MaterialField, Normalization
 
 
-def test_by_hand():
-    # 10^4..10^12: 10^6 lies a quarter of the way, 2 * 0.25 - 1 = -0.5.
-    values, clipped = normalize_and_count([[1e6, 1e3, 0.35]], DECADES)
-    np.testing.assert_allclose(values, [[-0.5, 0.0, 0.5]], atol=1e-6)
-    assert clipped.tolist() == [0, 0, 0]
-    assert values.dtype == np.float32
+def ranges(source: str, *spans: tuple[float, float]) -> Normalization:
+    return normalization_of(np.array(spans), source)
+
+
+DECADES = ranges("by hand", (4.0, 12.0), (2.0, 4.0), (0.2, 0.4))
 
 
 def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted():
-    values, clipped = normalize_and_count(
-        [[1e4, 1e2, 0.2], [1e12, 1e4, 0.4], [1e3, 1e5, 0.3], [1e13, 1e3, 0.5]], DECADES
-    )
-    np.testing.assert_array_equal(values[:2], [[-1, -1, -1], [1, 1, 1]])
-    np.testing.assert_allclose(values[2:], [[-1, 1, 0], [1, 0, 1]], atol=1e-6)
+    # 10^4..10^12: 10^6 lies a quarter of the way, 2 * 0.25 - 1 = -0.5.
+    properties = [[1e6, 1e3, 0.35], [1e4, 1e2, 0.2], [1e12, 1e4, 0.4], [np.nan] * 3]
+    values, clipped = normalize_and_count([*properties, [1e3, 1e5, 0.3], [1e13, 1e3, 0.5]], DECADES)
+    np.testing.assert_allclose(values[0], [-0.5, 0.0, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(values[1:4], [[-1, -1, -1], [1, 1, 1], [np.nan] * 3])
+    np.testing.assert_allclose(values[4:], [[-1, 1, 0], [1, 0, 1]], atol=1e-6)
     assert clipped.tolist() == [2, 1, 1]
+    assert values.dtype == np.float32
 
 
 def test_properties_are_mapped_and_brought_back_by_hand():
@@ -62,14 +55,7 @@ def test_properties_are_mapped_and_brought_back_by_hand():
 
 
 def test_values_of_other_ranges_by_hand_are_not_clipped():
-    wide = Normalization(
-        (
-            PropertyRange("youngs_modulus", True, 0.0, 16.0),
-            PropertyRange("density", True, 2.0, 6.0),
-            PropertyRange("poissons_ratio", False, 0.3, 0.4),
-        ),
-        source="by hand",
-    )
+    wide = ranges("by hand", (0.0, 16.0), (2.0, 6.0), (0.3, 0.4))
     # Of 4..12, 2..4 and 0.2..0.4: -0.5 is 6, 2.5 and 0.25; 1 is 12, 4 and 0.4.
     values = change_ranges([[-0.5] * 3, [1.0] * 3], DECADES, wide)
     np.testing.assert_allclose(values, [[-0.25, -0.75, -2.0], [0.5, 0.0, 1.0]], atol=1e-12)
@@ -82,19 +68,10 @@ def test_columns_without_a_range_are_refused(way, shape):
         way(np.ones(shape))
 
 
-def test_nan_passes_through_uncounted():
-    values, clipped = normalize_and_count([[np.nan, np.nan, np.nan]], DECADES)
-    assert np.isnan(values).all()
-    assert clipped.tolist() == [0, 0, 0]
+MATERIALS = st.tuples(st.floats(1.1e3, 7e10), st.floats(51, 7400), st.floats(0.211, 0.449))
 
 
-@given(
-    st.lists(
-        st.tuples(st.floats(1.1e3, 7e10), st.floats(51, 7400), st.floats(0.211, 0.449)),
-        min_size=1,
-        max_size=20,
-    )
-)
+@given(st.lists(MATERIALS, min_size=1, max_size=20))
 def test_the_inverse_is_exact_to_float32(rows):
     properties = np.array(rows, dtype=np.float32)
     values, clipped = normalize_and_count(properties, PIXIE_RANGES)
@@ -105,14 +82,9 @@ def test_the_inverse_is_exact_to_float32(rows):
 
 
 def _field(properties: list[list[float]]) -> MaterialField:
-    count = len(properties)
-    voxels = np.stack([np.arange(count)] * 3, axis=1).astype(np.uint8)
-    return MaterialField(
-        np.zeros((64, 64, 64), dtype=bool),
-        voxels,
-        np.zeros(count, np.uint8),
-        np.array(properties, np.float32),
-    )
+    rows = np.arange(len(properties), dtype=np.uint8)
+    occupancy, voxels = np.zeros((64, 64, 64), dtype=bool), np.stack([rows] * 3, axis=1)
+    return MaterialField(occupancy, voxels, 0 * rows, np.array(properties, np.float32))
 
 
 def test_dataset_ranges_span_all_assets():
@@ -127,9 +99,8 @@ def test_dataset_ranges_span_all_assets():
 
 def test_one_value_in_all_the_dataset_becomes_zero():
     field = _field([[1e5, 100, 0.3]])
-    values, clipped = normalize_and_count(
-        field.properties, ranges_from_extents([property_extent(field)])
-    )
+    own = ranges_from_extents([property_extent(field)])
+    values, clipped = normalize_and_count(field.properties, own)
     np.testing.assert_allclose(values, [[0, 0, 0]], atol=1e-6)
     assert clipped.sum() == 0
 
@@ -178,44 +149,27 @@ def test_pixie_s_own_file_gives_pixie_s_ranges(tmp_path, form):
     assert found.source == "normalization_ranges.yaml"
 
 
-def bad(name: str, *texts: str) -> list[tuple[str, str]]:
-    return [(name, text) for text in texts]
+def changed(**numbers: object) -> str:
+    return json.dumps(PIXIE_S_FILE | numbers)
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        *bad(
-            "ranges.yaml",
-            "",
-            "{",
-            "[" * 100_000,
-            '{"a":' * 100_000,
-            "density_p1: !!python/object/apply:os.system [ls]",
-            "- 1",
-            "density_p1: [1, 2]",
-            json.dumps(PIXIE_S_FILE | {"nu_min": "0.2"}),
-            json.dumps(PIXIE_S_FILE | {"nu_min": math.nan}),
-            json.dumps(PIXIE_S_FILE | {"nu_max": math.inf}),
-            json.dumps(PIXIE_S_FILE | {"E_max": 10**400}),
-            json.dumps(PIXIE_S_FILE | {"E_min": True}),
-            json.dumps(PIXIE_S_FILE | {"nu_min": 0.5}),
-            json.dumps({k: v for k, v in PIXIE_S_FILE.items() if k != "E_min"}),
-            "{}",
-        ),
-        *bad(
-            "ranges.toml",
-            "",
-            "[youngs_modulus]\nlo = true\nhi = 4\n",
-            "[youngs_modulus]\nlo = -1e308\nhi = 1e308\n",
-            "not toml at all",
-            "[youngs_modulus]\nlo = 3\nhi = 3\n",
-            "[youngs_modulus]\nlo = 3\nhi = inf\n",
-            "[youngs_modulus]\nlo = '3'\nhi = 4\n",
-            "youngs_modulus = 3\n",
-        ),
+MODULUS = "[youngs_modulus]\n"
+BAD = {
+    "ranges.yaml": [
+        "", "{", "{}", "[" * 100_000, '{"a":' * 100_000, "- 1", "density_p1: [1, 2]",
+        "density_p1: !!python/object/apply:os.system [ls]", changed(nu_min="0.2"),
+        changed(nu_min=math.nan), changed(nu_max=math.inf), changed(E_max=10**400),
+        changed(E_min=True), changed(nu_min=0.5), changed(E_min=None),
     ],
-)
+    "ranges.toml": [
+        "", "not toml at all", "youngs_modulus = 3\n", f"{MODULUS}lo = true\nhi = 4\n",
+        f"{MODULUS}lo = -1e308\nhi = 1e308\n", f"{MODULUS}lo = 3\nhi = 3\n",
+        f"{MODULUS}lo = 3\nhi = inf\n", f"{MODULUS}lo = '3'\nhi = 4\n",
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "text"), [(name, text) for name in BAD for text in BAD[name]])
 def test_bad_ranges_are_named_by_their_file(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.raises(ConfigError, match=name):

@@ -16,6 +16,7 @@ root = "grids"
 [slat]
 root = "latents"
 """
+TRAIN = '[normalize]\nobjects = "train"\n'
 
 
 @pytest.fixture
@@ -38,10 +39,12 @@ def message_of(path: Path | None, **arguments: object) -> str:
 
 
 def test_minimal_file_leaves_everything_else_at_its_default(folder):
-    parameters = load_parameters(write(folder, MINIMAL))
+    path = write(folder, MINIMAL)
+    parameters = load_parameters(path)
     assert parameters.name == "mine"
     assert parameters.align == AlignParameters()
     assert parameters.normalize.ranges == "dataset"
+    assert load_parameters(str(path)) == parameters
 
 
 def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
@@ -49,9 +52,8 @@ def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
 ):
     (folder / "map.csv").touch()
     (folder / "ranges.toml").touch()
-    path = write(
-        folder, MINIMAL + '[pairing]\nmap = "map.csv"\n[normalize]\nranges = "./ranges.toml"\n'
-    )
+    tables = '[pairing]\nmap = "map.csv"\n[normalize]\nranges = "./ranges.toml"\n'
+    path = write(folder, MINIMAL + tables)
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
     parameters = load_parameters(path)
     assert parameters.pixieverse.root == folder / "grids"
@@ -59,33 +61,23 @@ def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
     assert parameters.normalize.ranges == str(folder / "ranges.toml")
 
 
-def test_a_path_may_be_a_text(folder):
-    config = write(folder, MINIMAL)
-    assert load_parameters(str(config)) == load_parameters(config)
-
-
 def test_options_win_over_the_file(folder):
     (folder / "other").mkdir()
     path = write(folder, MINIMAL + '[normalize]\nranges = "dataset"\n')
-    other = str(folder / "other")
-    parameters = load_parameters(
-        path, {"pixieverse": {"root": other}, "normalize": {"ranges": "pixie"}}
-    )
+    given = {"pixieverse": {"root": str(folder / "other")}, "normalize": {"ranges": "pixie"}}
+    parameters = load_parameters(path, given)
     assert parameters.pixieverse.root == folder / "other"
     assert parameters.slat.root == folder / "latents"
     assert parameters.normalize.ranges == "pixie"
 
 
-def test_preset_replaces_the_align_table(folder):
-    path = write(folder, MINIMAL + '[align]\nengine = "small_gicp"\nradius = 2.5\n')
+def test_preset_replaces_tables_and_leaves_ranges_unless_it_has_its_own(folder):
+    tables = '[align]\nengine = "small_gicp"\nradius = 2.5\n[normalize]\nranges = "p2-p98"\n'
+    path = write(folder, MINIMAL + tables)
     assert load_parameters(path).align.radius == 2.5
     parameters = load_parameters(path, preset="paper")
     assert parameters.align == PRESETS["paper"].align
     assert parameters.sample == PRESETS["paper"].sample
-
-
-def test_preset_paper_takes_pixie_s_ranges_and_the_default_those_of_the_file(folder):
-    path = write(folder, MINIMAL + '[normalize]\nranges = "p2-p98"\n')
     ranges = [load_parameters(path, preset=p).normalize.ranges for p in (None, "default", "paper")]
     assert ranges == ["p2-p98", "p2-p98", "pixie"]
     given = load_parameters(path, {"normalize": {"ranges": "dataset"}}, "paper")
@@ -94,7 +86,7 @@ def test_preset_paper_takes_pixie_s_ranges_and_the_default_those_of_the_file(fol
 
 def test_lists_of_ids_lie_beside_the_definition(folder):
     (folder / "lists.json").write_text("{}")
-    named = '[normalize]\nobjects = "train"\nshares = [1, 0, 0]\nsplit_by = '
+    named = f"{TRAIN}shares = [1, 0, 0]\nsplit_by = "
     found = load_parameters(write(folder, MINIMAL + named + '"lists.json"\n')).normalize
     assert found.split_by == str(folder / "lists.json") and found.shares == (1.0, 0.0, 0.0)
     for rule in ("pixie", "category:tree", "hash"):
@@ -115,33 +107,18 @@ def test_patterns_are_lists(folder):
         ('[normalize]\nranges = "p1-p101"\n', ("normalize", "p1-p101", "p0 to p100")),
         ('[normalize]\nranges = "p1-pnan"\n', ("normalize.ranges", "does not exist", "p1-p99")),
         ('[normalize]\nsplit_by = "pixie"\n', ("normalize", "objects = 'train'")),
-        (
-            '[normalize]\nranges = "pixie"\nobjects = "train"\n',
-            ("normalize", "percentiles of it where objects"),
-        ),
-        (
-            '[normalize]\nobjects = "train"\nshares = [0.5, 0.5, 0.5]\n',
-            ("normalize", "add up to 1"),
-        ),
-        (
-            '[normalize]\nobjects = "train"\nsplit_by = "nothing.json"\n',
-            ("normalize.split_by", "nothing.json", "does not exist"),
-        ),
+        (f'{TRAIN}ranges = "pixie"\n', ("normalize", "percentiles of it where objects")),
+        (f"{TRAIN}shares = [0.5, 0.5, 0.5]\n", ("normalize", "add up to 1")),
+        (f'{TRAIN}split_by = "no.json"\n', ("normalize.split_by", "no.json", "does not exist")),
         ('[align]\nengine = "magic"\n', ("align.engine", "'magic'", "'open3d'")),
         ("[align]\nradius = true\n", ("align.radius", "True", "number")),
         ('[align]\nradius = "3"\n', ("align.radius", "'3'", "number")),
         ("[align]\nradius = -1.0\n", ("align.radius", "-1.0", "greater than 0")),
         ("[align]\nradius = nan\n", ("align.radius", "nan", "finite number")),
-        (
-            "[align]\n\nscale_bounds = [1.2, 1.6]\n",
-            ("align.scale_bounds.0", "1.2", "less than or equal to 1"),
-        ),
+        ("[align]\nscale_bounds = [1.2, 1.6]\n", ("align.scale_bounds.0", "1.2", "or equal to 1")),
         ("align.radius = 1.5\n", ("slat.align", "unknown key")),
         ("[alingment]\n", ("alingment", "unknown key", "did you mean 'align'")),
-        (
-            "[store]\ncompression_level = 23\n",
-            ("store.compression_level", "less than or equal to 22"),
-        ),
+        ("[store]\ncompression_level = 23\n", ("store.compression_level", "or equal to 22")),
         ("[store]\nvoxel_chunk = 2000000\n", ("store.voxel_chunk", "equal to 1048576")),
         ("[store]\nvoxel_chunks_per_shard = 2000000\n", ("per_shard", "equal to 1048576")),
         ("[store]\nvoxel_chunks_per_shard = 100000\n", ("store: got", "at most 268435456 rows")),
@@ -172,14 +149,10 @@ def test_fault_is_reported_with_file_key_value_and_what_is_allowed(folder, addit
 
 
 def test_missing_root_says_both_ways_to_give_it(folder):
-    path = write(folder, '[pixieverse]\nroot = "grids"\n')
-    message = message_of(path)
+    message = message_of(write(folder, '[pixieverse]\nroot = "grids"\n'))
     assert "slat.root: not given" in message
     assert "--slat" in message and "[slat]" in message
     assert "--pixieverse" in message_of(None)
-
-
-def test_missing_root_inside_its_table_names_the_file(folder):
     path = write(folder, '[pixieverse]\nsample = "0"\n[slat]\nroot = "latents"\n')
     assert message_of(path).startswith(f"{path}: pixieverse.root: not given")
 
@@ -189,27 +162,17 @@ def test_fault_in_an_option_names_the_option(folder):
     message = message_of(path, overrides={"slat": {"root": str(folder / "nowhere")}})
     assert message.startswith("option --slat: slat.root: ")
     assert "nowhere does not exist" in message
-
-
-def test_group_that_is_no_table_is_named(folder):
     path = write(folder, "slat = 3\n")
     message = message_of(path, overrides={"slat": {"root": "x"}})
     assert message.startswith(f"{path}: slat: ") and "table" in message
 
 
-def test_invalid_toml_names_file_and_line(folder):
+def test_what_is_no_definition_is_named(folder):
     path = write(folder, MINIMAL + "[align\n")
     message = message_of(path)
     assert message.startswith(f"{path}: not valid TOML") and "line 8" in message
-
-
-def test_unreadable_file_is_a_config_error(folder):
     assert "absent.toml" in message_of(folder / "absent.toml")
-    path = folder / "binary.toml"
-    path.write_bytes(b"\xff\xfe\x00")
-    assert "binary.toml" in message_of(path)
-
-
-def test_unknown_preset_lists_those_there_are(folder):
+    (folder / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    assert "binary.toml" in message_of(folder / "binary.toml")
     message = message_of(write(folder, MINIMAL), preset="papr")
     assert "papr" in message and "paper" in message

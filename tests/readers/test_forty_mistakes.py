@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,44 +35,45 @@ def said(parameters: BuildParameters) -> str:
         return str(error)
 
 
-def grid(change: Callable[[np.ndarray], object]) -> Callable[[Dataset], None]:
-    """Return what changes the grid's file; `change` returns a new one or changes it in place."""
+Change = Callable[[np.ndarray], np.ndarray]
+
+
+def grid(change: Change) -> Callable[[Dataset], None]:
+    """Return what replaces the grid's file."""
 
     def run(dataset: Dataset) -> None:
-        values = np.load(dataset.root / GRID)
-        new = change(values)
-        np.save(dataset.root / GRID, values if new is None else np.asarray(new))
+        np.save(dataset.root / GRID, change(np.load(dataset.root / GRID)))
 
     return run
 
 
-def channel(k: int, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Dataset], None]:
-    def run(values: np.ndarray) -> None:
-        inside = values[..., 3] != 7
-        values[inside, k] = change(values[inside, k])
+def values(**changes: Change) -> Callable[[Dataset], None]:
+    """Return what changes the density, E, nu or class of all voxels but the background."""
+
+    def run(whole: np.ndarray) -> np.ndarray:
+        inside = whole[..., 3] != 7
+        for name, change in changes.items():
+            at = ("density", "e", "nu", "material").index(name)
+            whole[inside, at] = change(whole[inside, at])
+        return whole
 
     return grid(run)
 
 
-def stuff(*values: float) -> Callable[[Dataset], None]:
-    """Return what gives all voxels the same density, modulus, ratio and perhaps class."""
-
-    def run(whole: np.ndarray) -> None:
-        whole[whole[..., 3] != 7, : len(values)] = values
-
-    return grid(run)
+def over(factor: float) -> Change:
+    return lambda one: one / factor
 
 
-def both_in_log10(dataset: Dataset) -> None:
-    for k in (0, 1):
-        channel(k, np.log10)(dataset)
+def all_of(**stuff: float) -> Callable[[Dataset], None]:
+    """Return what gives all voxels the same values."""
+    return values(**{name: partial(np.full_like, fill_value=v) for name, v in stuff.items()})
 
 
 def order(*channels: int) -> Callable[[Dataset], None]:
-    return grid(lambda values: values[..., list(channels)])
+    return grid(lambda whole: whole[..., list(channels)])
 
 
-def slat(**change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Dataset], None]:
+def slat(**change: Change) -> Callable[[Dataset], None]:
     def run(dataset: Dataset) -> None:
         with np.load(dataset.root / SLAT) as file:
             arrays = {name: change.get(name, lambda one: one)(file[name]) for name in file}
@@ -80,28 +82,13 @@ def slat(**change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Dataset], No
     return run
 
 
+def group_of_two(coords: np.ndarray) -> np.ndarray:
+    batch = np.arange(len(coords)) >= len(coords) // 2
+    return np.column_stack([batch.astype(np.int32), coords])
+
+
 def shell(change: Callable[[Path], object]) -> Callable[[Dataset], None]:
     return lambda dataset: change(dataset.root) and None
-
-
-def normalised(values: np.ndarray) -> None:
-    inside = values[..., 3] != 7
-    values[inside, :3] = np.column_stack(
-        [
-            np.log10(values[inside, 0]) - 3.2,
-            np.log10(values[inside, 1]) / 8 - 1,
-            0 * values[inside, 2] - 0.3,
-        ]
-    )
-
-
-def classes(table: dict[int, int]) -> Callable[[Dataset], None]:
-    def run(values: np.ndarray) -> None:
-        for old, new in table.items():
-            values[values[..., 3] == old, 3] = new + 100
-        values[values[..., 3] >= 100, 3] -= 100
-
-    return grid(run)
 
 
 def deeper(root: Path) -> None:
@@ -115,63 +102,71 @@ def outside(root: Path) -> None:
     (root / GRID).symlink_to(root.parent / "grid.npy")
 
 
-def group_of_two(values: np.ndarray) -> np.ndarray:
-    with_batch = np.concatenate([np.zeros((len(values), 1), np.int32), values], axis=1)
-    with_batch[len(values) // 2 :, 0] = 1
-    return with_batch
+def nowhere(root: Path) -> None:
+    (root / GRID).unlink()
+    (root / GRID).symlink_to("gone")
 
 
+NORMALISED = values(
+    density=lambda d: np.log10(d) - 3.2, e=lambda e: np.log10(e) / 8 - 1, nu=lambda n: 0 * n - 0.3
+)
 UNITS = {
-    "E in GPa": (channel(1, lambda e: e / 1e9), "look like GPa"),
-    "E in MPa": (channel(1, lambda e: e / 1e6), "MPa"),
-    "E in kPa, of steel": (stuff(7850, 2e5, 0.3), "metal's density"),
-    "density in g/cm^3": (channel(0, lambda d: d / 1e3), "look like g/cm^3"),
-    "E in GPa and density in g/cm^3": (
-        grid(lambda v: (v / (1e3, 1e9, 1, 1)).astype(np.float32)),
-        "GPa and g/cm^3",
+    "E in GPa": (values(e=over(1e9)), "look like GPa"),
+    "E in MPa": (values(e=over(1e6)), "MPa"),
+    "E in kPa, of steel": (all_of(density=7850, e=2e5, nu=0.3), "metal's density"),
+    "density in g/cm^3": (values(density=over(1e3)), "look like g/cm^3"),
+    "E in GPa and density in g/cm^3": (values(e=over(1e9), density=over(1e3)), "GPa and g/cm^3"),
+    "log10 E": (values(e=np.log10), "log10 Pa"),
+    "log10 density": (values(density=np.log10), "log10 kg/m^3"),
+    "log10 of E and of density": (
+        values(e=np.log10, density=np.log10),
+        "log10 Pa and log10 kg/m^3",
     ),
-    "log10 E": (channel(1, np.log10), "log10 Pa"),
-    "log10 density": (channel(0, np.log10), "log10 kg/m^3"),
-    "log10 of E and of density": (both_in_log10, "log10 Pa and log10 kg/m^3"),
-    "normalised for raw": (grid(normalised), "look like normalised ones|unphysical"),
-    "rubber as dense as steel": (stuff(7850, 2e6, 0.3), "metal's density"),
+    "normalised for raw": (NORMALISED, "look like normalised ones|unphysical"),
+    "rubber as dense as steel": (all_of(density=7850, e=2e6, nu=0.3), "metal's density"),
     "nu in percent": (
-        channel(2, lambda n: n * 100),
+        values(nu=over(0.01)),
         "Poisson's ratio 30, and all materials have|unphysical",
     ),
-    "negative E": (channel(1, lambda e: -e), "unphysical"),
+    "negative E": (values(e=np.negative), "unphysical"),
     "E above 65,504 in float16": (
-        grid(lambda v: v.astype(np.float16)),
+        grid(lambda whole: whole.astype(np.float16)),
         "float16 holds nothing above 65,504",
     ),
-    "E of 0": (channel(1, lambda e: e * 0), "unphysical"),
+    "E of 0": (values(e=np.zeros_like), "unphysical"),
 }
 LAYOUT = {
     "a raw grid, channels first": (
-        grid(lambda v: np.moveaxis(v, -1, 0)),
+        grid(lambda whole: np.moveaxis(whole, -1, 0)),
         "raw grid in SI units, channels first",
     ),
     "E before density": (order(1, 0, 2, 3), "swapped columns"),
     "nu first": (order(2, 1, 0, 3), "swapped columns"),
     "class id first": (order(3, 0, 1, 2), "unknown class"),
     "a prediction, channels last": (
-        grid(lambda v: np.zeros((64, 64, 64, 11), np.float32)),
+        grid(lambda whole: np.zeros((64, 64, 64, 11), np.float32)),
         "has shape (64, 64, 64, 11)",
     ),
-    "a grid of 32^3": (grid(lambda v: v[::2, ::2, ::2]), "has shape (32, 32, 32, 4)"),
-    "a grid of integers": (grid(lambda v: v.astype(np.int64)), "has dtype"),
-    "a pickled grid": (grid(lambda v: np.array([{"grid": 1}], object)), "pickle"),
-    "class ids of PhysGaussian's own table": (stuff(200, 1e5, 0.2, 4), "PhysGaussian's table"),
-    "a class id above 7": (classes({0: 8}), "unknown class 8"),
-    "all background": (classes({0: 7, 1: 7}), "all are background"),
+    "a grid of 32^3": (grid(lambda whole: whole[::2, ::2, ::2]), "has shape (32, 32, 32, 4)"),
+    "a grid of integers": (grid(lambda whole: whole.astype(np.int64)), "has dtype"),
+    "a pickled grid": (grid(lambda whole: np.array([{"grid": 1}], object)), "pickle"),
+    "class ids of PhysGaussian's own table": (
+        all_of(density=200, e=1e5, nu=0.2, material=4),
+        "PhysGaussian's table",
+    ),
+    "a class id above 7": (
+        values(material=lambda one: np.where(one == 0, 8, one)),
+        "unknown class 8",
+    ),
+    "all background": (all_of(material=7), "all are background"),
     "coords beyond the grid": (slat(coords=lambda c: c.astype(np.int32) * 4), "out of range"),
     "coords of 32^3": (
-        slat(coords=lambda c: np.unique(c // 2, axis=0), feats=lambda f: f),
+        slat(coords=lambda c: np.unique(c // 2, axis=0)),
         "rows of coords|no coordinate is above",
     ),
     "two assets in a file": (slat(coords=group_of_two), "more than one asset"),
     "coords twice": (slat(coords=lambda c: np.vstack([c[:-1], c[:1]])), "occurs twice"),
-    "feats first": (slat(feats=lambda f: f.T), "has shape"),
+    "feats first": (slat(feats=np.transpose), "has shape"),
     "feats of another encoder": (slat(feats=lambda f: np.tile(f, 4)), "slat.encoder: trellis"),
     "NaN in feats": (slat(feats=lambda f: f * np.nan), "feats is nan"),
     "standardised feats": (
@@ -199,10 +194,7 @@ NAMES = {
         "truncated or damaged",
     ),
     "a link out of the root": (shell(outside), "out of its root"),
-    "a link to nothing": (
-        shell(lambda r: ((r / GRID).unlink(), (r / GRID).symlink_to("gone"))),
-        "is a link that leads nowhere",
-    ),
+    "a link to nothing": (shell(nowhere), "is a link that leads nowhere"),
 }
 MISTAKES = {**UNITS, **LAYOUT, **NAMES}
 

@@ -41,20 +41,13 @@ def mask_of(grid: np.ndarray) -> np.ndarray:
     return (grid[..., 3] != 7).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda grid: grid,
-        np.asfortranarray,
-        lambda grid: grid.astype(">f4"),
-        lambda grid: grid.astype(np.float64),
-    ],
-    ids=["plain", "fortran", "big-endian", "float64"],
-)
-@pytest.mark.parametrize("masked", [False, True])
-def test_raw_grid(make_pair, change, masked):
+@pytest.mark.parametrize("grid_dtype", ["f4", ">f4", "f8"])
+@pytest.mark.parametrize("mask_dtype", [None, "bool", "u1", "i8", "f2", "f4", ">f8"])
+def test_raw_grid(make_pair, grid_dtype, mask_dtype):
     grid = raw_grid()
-    field = read_field(make_pair(grid=change(grid), mask=mask_of(grid) if masked else None))
+    mask = None if mask_dtype is None else mask_of(grid).astype(mask_dtype)
+    order = "F" if mask_dtype == "bool" else "C"
+    field = read_field(make_pair(grid=grid.astype(grid_dtype, order=order), mask=mask))
 
     assert field.voxels.tolist() == VOXELS
     assert field.voxels.dtype == np.uint8
@@ -142,12 +135,6 @@ def test_disagreeing_mask_is_believed_and_reported(make_pair):
     )
 
 
-@pytest.mark.parametrize("dtype", [bool, np.uint8, np.int64, np.float16, np.float32, ">f8"])
-def test_mask_dtypes(make_pair, dtype):
-    field = read_field(make_pair(mask=mask_of(raw_grid()).astype(dtype)))
-    assert np.argwhere(field.occupancy).tolist() == VOXELS
-
-
 def test_soft_mask_is_cut_at_one_half(make_pair):
     mask = mask_of(raw_grid())
     mask[1, 2, 3], mask[1, 2, 4] = 0.5, 0.75
@@ -161,28 +148,20 @@ def test_sources_are_named_and_hashed(make_pair):
     sources = {source.role: source for source in read_field(pair).sources}
     assert list(sources) == ["grid", "mask", "bounds"]
     for role, path in (("grid", pair.grid), ("mask", pair.mask), ("bounds", pair.bounds)):
-        data = path.read_bytes()
-        assert sources[role].sha256 == hashlib.sha256(data).hexdigest()
-        assert sources[role].size == len(data)
-        assert sources[role].path == f"a/{path.name}"
+        data, source = path.read_bytes(), sources[role]
+        assert source.sha256 == hashlib.sha256(data).hexdigest()
+        assert (source.size, source.path) == (len(data), f"a/{path.name}")
 
 
 def test_bounds_are_json_ready(make_pair):
     bounds = {
-        "min_bounds": (-0.5, -0.5, -0.25),
-        "voxel_size": np.float64(0.015625),
-        "grid_shape": (64, 64, 64),
-        "alpha_weighted": True,
-        "model": "ViT-L",
-    }
-    read = read_field(make_pair(bounds=bounds)).bounds
-    assert json.loads(json.dumps(read)) == {
         "min_bounds": [-0.5, -0.5, -0.25],
         "voxel_size": 0.015625,
         "grid_shape": [64, 64, 64],
         "alpha_weighted": True,
         "model": "ViT-L",
     }
+    assert json.loads(json.dumps(read_field(make_pair(bounds=bounds)).bounds)) == bounds
 
 
 def test_unreadable_bounds_are_a_warning(make_pair):
@@ -238,9 +217,7 @@ UNPHYSICAL = {
     "negative Poisson's ratio": (2, -0.01, "Poisson's ratio -0.01", "[0, 0.5]"),
     "Poisson's ratio NaN": (2, np.nan, "Poisson's ratio nan", "[0, 0.5]"),
     "no density": (0, 0.0, "density 0", "above 0 kg"),
-    "negative density": (0, -1.0, "density -1", "above 0 kg"),
     "endless density": (0, np.inf, "density inf", "a finite density"),
-    "no modulus": (1, 0.0, "Young's modulus 0", "above 0 Pa"),
     "negative modulus": (1, -5.0, "Young's modulus -5", "above 0 Pa"),
     "modulus NaN": (1, np.nan, "Young's modulus nan", "finite Y"),
     "modulus beyond float32": (1, 1e39, "Young's modulus 1e+39", "finite"),
@@ -256,8 +233,7 @@ def test_an_unphysical_voxel_is_not_annotated_and_one_of_few_is_refused(make_pai
     read = read_field(make_pair(grid=grid))
     assert [20, 21, 20] not in read.voxels.tolist()
     assert len(read.voxels) == len(read.material) == len(read.properties) == 11
-    assert read.occupancy[20, 21, 20]
-    assert read.unphysical == 1
+    assert read.occupancy[20, 21, 20] and read.unphysical == 1
     assert read.warnings == (
         f"1 voxels are unphysical, the first by {named} at annotated voxel (20, 21, 20); "
         "not annotated",
@@ -270,17 +246,11 @@ def test_an_unphysical_voxel_is_not_annotated_and_one_of_few_is_refused(make_pai
     assert expected in caught.value.expected
 
 
-def test_a_predicted_voxel_that_is_not_finite_is_not_annotated(make_pair):
-    grid = raw_grid()
-    grid[20:23, 20:23, 20] = 900.0, 1.0e6, 0.3, 2
-    prediction = prediction_of(grid, scores=True)
-    prediction[1, 20, 21, 20] = np.inf  # not a very large value that may be clipped
-    read = read_field(make_pair(grid=prediction))
-    assert len(read.voxels) == 11
-    assert read.unphysical == 1
-
-
 def test_an_asset_fails_by_the_share_of_its_unphysical_voxels(make_pair):
+    prediction = prediction_of(raw_grid(), scores=True)
+    prediction[1, 1, 2, 3] = np.inf  # not a very large value that may be clipped
+    read = read_field(make_pair(grid=prediction), 1 / 3)
+    assert (len(read.voxels), read.unphysical) == (2, 1)
     grid = raw_grid()
     grid[1, 2, 3, 2] = 0.7
     assert len(read_field(make_pair(grid=grid), 1 / 3).voxels) == 2
@@ -325,13 +295,5 @@ def test_a_bad_grid_or_mask_is_named(make_pair, kind, fault):
     with pytest.raises(InputError) as caught:
         read_field(pair)
     assert caught.value.path == str(getattr(pair, kind))
-    assert what in caught.value.fault
-    assert expected in caught.value.expected
+    assert what in caught.value.fault and expected in caught.value.expected
     assert "\n" not in str(caught.value)
-
-
-def test_mask_beside_the_object_leaves_nothing_annotated(make_pair):
-    mask = np.zeros((64, 64, 64), bool)
-    mask[30, 30, 30] = True
-    with pytest.raises(InputError, match="none of the 1 occupied voxels is annotated"):
-        read_field(make_pair(mask=mask))

@@ -41,17 +41,15 @@ def refused(match: str, read: Callable[..., object], *arguments: object, below: 
         read(*arguments)
 
 
-@pytest.mark.parametrize(
-    "name", ["../outside.npy", "sub/../../outside.npy", "link.npy", "folder_link/outside.npy"]
-)
-def test_paths_that_leave_the_root(tmp_path, name):
+def test_paths_that_leave_the_root(tmp_path):
     root = tmp_path / "root"
     (root / "sub").mkdir(parents=True)
     np.save(tmp_path / "outside.npy", COORDS)
     (root / "link.npy").symlink_to(tmp_path / "outside.npy")
-    (root / "folder_link").symlink_to(tmp_path)
-    with pytest.raises(InputError, match="out of its root"):
-        load_source(root / name, root, "grid")
+    (root / "folder").symlink_to(tmp_path)
+    for name in ("../outside.npy", "sub/../../outside.npy", "link.npy", "folder/outside.npy"):
+        with pytest.raises(InputError, match="out of its root"):
+            load_source(root / name, root, "grid")
 
 
 def test_paths_that_are_no_file_of_the_root(tmp_path):
@@ -141,25 +139,19 @@ def test_npz_bomb_is_not_inflated_whatever_its_directory_says():
     refused(told, npz_arrays, lie, "x.npz", ROWS, below=4)
 
 
-@pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_npz_of_other_compression_is_refused(compression):
-    with pytest.raises(InputError, match="uses zip compression"):
-        npz_arrays(npz_bytes(compression, feats=npy(FEATS)), "x.npz", ROWS)
-
-
-def test_npz_with_two_arrays_of_one_name():
+def test_npz_that_numpy_does_not_write_is_refused():
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("feats.npy", npy(FEATS))
         archive.writestr("feats.npy", npy(FEATS))
-    with pytest.raises(InputError, match="has 2 arrays named 'feats'"):
-        npz_arrays(file.getvalue(), "x.npz", ROWS)
-
-
-def test_npz_with_very_many_members():
-    many = npz_bytes(**{f"m{i}": b"" for i in range(300)})
-    with pytest.raises(InputError, match="more than 256 members"):
-        npz_arrays(many, "x.npz", ROWS)
+    for data, said in (
+        (npz_bytes(zipfile.ZIP_BZIP2, feats=npy(FEATS)), "uses zip compression"),
+        (npz_bytes(zipfile.ZIP_LZMA, feats=npy(FEATS)), "uses zip compression"),
+        (file.getvalue(), "has 2 arrays named 'feats'"),
+        (npz_bytes(**{f"m{i}": b"" for i in range(300)}), "more than 256 members"),
+    ):
+        with pytest.raises(InputError, match=said):
+            npz_arrays(data, "x.npz", ROWS)
 
 
 def test_hdf5_that_claims_or_inflates_to_gigabytes_costs_nothing(make_pair):
