@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 def in_unicode(text: str) -> str:
     r"""Return a text in which whatever UTF-8 cannot hold is written out.
@@ -70,3 +73,15 @@ class StoreError(SlatprepError):
 
 class UnknownAssetError(StoreError, ConfigError):
     """A name that no asset of a store has, or several: the caller's mistake, not the store's."""
+
+
+@contextmanager
+def needing(
+    package: str, what: str, extra: str, kind: type[SlatprepError] = ConfigError
+) -> Iterator[None]:
+    """Import an optional package; an error that says how to install it where that fails."""
+    try:
+        yield
+    except ImportError as error:
+        way = f"install it with `pip install 'slatprep[{extra}]'`"
+        raise kind(f"{what} the package {package}; {way}") from error

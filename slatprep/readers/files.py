@@ -102,11 +102,9 @@ class ArraySpec:
     def check(self, where: str | Place, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         """Raise InputError, naming `where`, unless shape and dtype are allowed."""
         if dtype.hasobject:
-            raise InputError(
-                where,
-                "holds Python objects, which only pickle could read, and pickle can run code",
-                "a plain numeric array; save it again with allow_pickle=False",
-            )
+            fault = "holds Python objects, which only pickle could read, and pickle can run code"
+            way = "a plain numeric array; save it again with allow_pickle=False"
+            raise InputError(where, fault, way)
         if dtype.kind not in self.kinds or not 0 < dtype.itemsize <= 512:
             kinds = " or ".join(_KIND_NAMES[kind] for kind in self.kinds)
             raise InputError(where, f"has dtype {dtype.str}", f"an array of {kinds}")
@@ -114,9 +112,8 @@ class ArraySpec:
             texts = " or ".join(_shape_text(allowed, self.max_rows) for allowed in self.shapes)
             raise InputError(where, f"has shape {_shape_text(shape)}", f"shape {texts}{self.note}")
         if not self.shapes and (len(shape) > 8 or not 0 < math.prod(shape) <= self.max_items):
-            raise InputError(
-                where, f"has shape {_shape_text(shape)}", f"1 to {self.max_items} values"
-            )
+            fault = f"has shape {_shape_text(shape)}"
+            raise InputError(where, fault, f"1 to {self.max_items} values")
 
     def _fits(self, shape: tuple[int, ...], allowed: tuple[int | range | None, ...]) -> bool:
         return len(shape) == len(allowed) and all(
@@ -138,9 +135,8 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
     """
     if pair.grid is None or pair.slat is None:
         root = pair.roots.pixieverse if pair.grid is None else pair.roots.slat
-        raise MissingPartnerError(
-            root, pair.problem or f"nothing for id {pair.asset_id!r}", "a grid and a SLAT per id"
-        )
+        fault = pair.problem or f"nothing for id {pair.asset_id!r}"
+        raise MissingPartnerError(root, fault, "a grid and a SLAT per id")
     if pair.problem:
         # Not by a file's name: which side is at fault, the problem says.
         fault, _, expected = pair.problem.rpartition("; expected ")
@@ -171,11 +167,8 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "a readable file") from None
     if len(data) > MAX_FILE_BYTES:
-        raise InputError(
-            path,
-            f"is larger than {MAX_FILE_BYTES >> 20} MiB",
-            "the files of one asset, which are smaller",
-        )
+        fault = f"is larger than {MAX_FILE_BYTES >> 20} MiB"
+        raise InputError(path, fault, "the files of one asset, which are smaller")
     if not data:
         raise InputError(path, "has zero bytes", _COMPLETE)
     return data, SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
@@ -236,14 +229,10 @@ def npz_arrays(
         wanted = [name for name in specs if not partial or name in present]
         for name in wanted:
             if present.count(name) != 1:
-                names = sorted(present)
-                more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-                found = (", ".join(names[:8]) or "nothing") + more
-                raise InputError(
-                    where,
-                    f"has {present.count(name)} arrays named {name!r} (it holds {found})",
-                    f"one array each of {', '.join(specs)}",
-                )
+                more = f" and {len(present) - 8} more" if len(present) > 8 else ""
+                found = (", ".join(sorted(present)[:8]) or "nothing") + more
+                fault = f"has {present.count(name)} arrays named {name!r} (it holds {found})"
+                raise InputError(where, fault, f"one array each of {', '.join(specs)}")
         return {
             name: _read_member(archive, infos[present.index(name)], where, specs[name])
             for name in wanted
@@ -282,11 +271,8 @@ def _read_member(
     member = f"{where} [{info.filename.removesuffix('.npy')}]"
     # zipfile bounds its output for these two alone.
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise InputError(
-            member,
-            f"uses zip compression {info.compress_type}",
-            "stored or deflated members, as numpy.savez and numpy.savez_compressed write",
-        )
+        expected = "stored or deflated members, as numpy.savez and numpy.savez_compressed write"
+        raise InputError(member, f"uses zip compression {info.compress_type}", expected)
     with refusing(member, "is damaged", _INTACT_NPZ), archive.open(info) as stream:
         prefix = stream.read(_MAX_HEADER_BYTES)
         _header(prefix, info.file_size, member, spec)
@@ -313,11 +299,8 @@ def _header(
     wanted = math.prod(shape) * dtype.itemsize
     held = size - offset
     if held != wanted:
-        raise InputError(
-            where,
-            f"is truncated or damaged: its header announces {wanted} bytes of data, it has {held}",
-            _COMPLETE,
-        )
+        fault = f"its header announces {wanted} bytes of data, it has {held}"
+        raise InputError(where, f"is truncated or damaged: {fault}", _COMPLETE)
     return shape, fortran, dtype, offset
 
 

@@ -83,14 +83,13 @@ def group_arrays(
 
     holder = file
     for name in filter(None, group.split("/")):
-        holder = _child(holder, name, f"{path} [{group}]", h5py.Group, "group")
+        holder = _child(holder, name, f"{path} [{group}]", h5py.Group)
     arrays = {}
     for name, spec in specs.items():
         if partial and not holder.id.links.exists(name.encode()):
             continue
         where = f"{path} [{'/'.join(filter(None, (group, name)))}]"
-        dataset = _child(holder, name, where, h5py.Dataset, "dataset")
-        arrays[name] = _read_dataset(dataset, where, spec)
+        arrays[name] = _read_dataset(_child(holder, name, where, h5py.Dataset), where, spec)
     return arrays
 
 
@@ -118,36 +117,32 @@ def _walk_groups(
 
     for key in group:
         # h5py gives bytes where a name is no UTF-8.
-        name = key.decode(errors="surrogateescape") if isinstance(key, bytes) else key
+        raw = key if isinstance(key, bytes) else key.encode()
+        name = raw.decode(errors="surrogateescape")
         fields = match(components[0], known, name)
-        if (
-            fields is not None
-            and group.id.links.get_info(name.encode(errors="surrogateescape")).type
-            == h5py.h5l.TYPE_HARD
-            and isinstance(group[key], h5py.Group)
-        ):
+        if fields is None or group.id.links.get_info(raw).type != h5py.h5l.TYPE_HARD:
+            continue
+        if isinstance(inner := group[key], h5py.Group):
             if len(components) == 1:
                 yield known | fields, prefix + name
             else:
-                yield from _walk_groups(
-                    group[key], components[1:], known | fields, f"{prefix}{name}/"
-                )
+                further = known | fields, f"{prefix}{name}/"
+                yield from _walk_groups(inner, components[1:], *further)
 
 
-def _child(parent: h5py.Group, name: str, where: str, kind: type, kind_name: str) -> Any:
+def _child(parent: h5py.Group, name: str, where: str, kind: type) -> Any:
     import h5py
 
-    key = name.encode()
+    word, links = kind.__name__.lower(), parent.id.links
     # Asking h5py itself whether a name exists would follow an external link.
-    if not parent.id.links.exists(key):
-        raise InputError(where, f"has no {kind_name} {name!r}", "coords and feats of one asset")
-    if parent.id.links.get_info(key).type != h5py.h5l.TYPE_HARD:
-        raise InputError(
-            where, f"{name!r} is a soft or external link", f"the {kind_name} itself in the file"
-        )
+    if not links.exists(name.encode()):
+        raise InputError(where, f"has no {word} {name!r}", "coords and feats of one asset")
+    if links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
+        fault = f"{name!r} is a soft or external link"
+        raise InputError(where, fault, f"the {word} itself in the file")
     child = parent[name]
     if not isinstance(child, kind):
-        raise InputError(where, f"{name!r} is no {kind_name}", f"a {kind_name}")
+        raise InputError(where, f"{name!r} is no {word}", f"a {word}")
     return child
 
 
@@ -182,12 +177,9 @@ def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
     properties = dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
     if set(filters) - _FILTER_NAMES.keys() or len(set(filters)) < len(filters):
-        raise InputError(
-            where,
-            f"uses HDF5 filters {filters}",
-            f"each at most once of {', '.join(_FILTER_NAMES.values())}; "
-            "h5repack -f GZIP=1 rewrites a file",
-        )
+        known = f"each at most once of {', '.join(_FILTER_NAMES.values())}"
+        way = "h5repack -f GZIP=1 rewrites a file"
+        raise InputError(where, f"uses HDF5 filters {filters}", f"{known}; {way}")
     dtype, steps = dataset.dtype, dataset.chunks
     if not dataset.id.get_type().equal(h5py.h5t.py_create(dtype)):
         raise InputError(where, "stores a number format of its own", "IEEE floats or integers")
@@ -195,17 +187,13 @@ def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
     offsets = [range(0, n, step) for n, step in zip(dataset.shape, steps, strict=True)]
     wanted = math.prod(map(len, offsets))
     if chunk_bytes > _MAX_CHUNK_BYTES or wanted > _MAX_CHUNKS:
-        raise InputError(
-            where,
-            f"has {wanted} chunks of {chunk_bytes} bytes",
-            f"at most {_MAX_CHUNKS} chunks of at most {_MAX_CHUNK_BYTES} bytes",
-        )
+        most = f"at most {_MAX_CHUNKS} chunks of at most {_MAX_CHUNK_BYTES} bytes"
+        raise InputError(where, f"has {wanted} chunks of {chunk_bytes} bytes", most)
     chunks: dict[tuple[int, ...], Any] = {}
     dataset.id.chunk_iter(lambda info: chunks.update({info.chunk_offset: info}))
     if chunks.keys() != set(product(*offsets)):
-        raise InputError(
-            where, f"its {len(chunks)} chunks are not the {wanted} that cover it", _WRITTEN
-        )
+        fault = f"its {len(chunks)} chunks are not the {wanted} that cover it"
+        raise InputError(where, fault, _WRITTEN)
 
     array = np.empty(dataset.shape, dtype.newbyteorder("="))
     for corner, chunk in chunks.items():
@@ -216,11 +204,9 @@ def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
             applied = [code for bit, code in enumerate(filters) if not skipped >> bit & 1]
             data = _undo(applied, raw, chunk_bytes, dtype.itemsize)
         if len(data) != chunk_bytes:
-            raise InputError(
-                where,
-                f"the chunk at {corner} is damaged: it does not unpack to {chunk_bytes} bytes",
-                "chunks of the size that the dataset states; copy or make the file again",
-            )
+            fault = f"the chunk at {corner} is damaged: it does not unpack to {chunk_bytes} bytes"
+            expected = "chunks of the size that the dataset states; copy or make the file again"
+            raise InputError(where, fault, expected)
         place_chunk(array, corner, np.frombuffer(data, dtype).reshape(steps))
     return array
 

@@ -60,12 +60,9 @@ def read_map(
                 if own or (object_id and (object_id in objects or slat_id in slats)):
                     view = (row.get("view") or "") if own else ""
                     claims.setdefault(object_id, {})[slat_id, view] = None
-    except UnicodeDecodeError:
-        raise ConfigError(
-            f"{path}: cannot be read as a map of ids: save it as CSV in UTF-8"
-        ) from None
-    except (OSError, csv.Error) as error:
-        raise ConfigError(f"{path}: cannot be read as a map of ids ({error})") from None
+    except (OSError, csv.Error, UnicodeDecodeError) as error:
+        reason = "save it as CSV in UTF-8" if isinstance(error, UnicodeDecodeError) else error
+        raise ConfigError(f"{path}: cannot be read as a map of ids ({reason})") from None
     return {object_id: list(named) for object_id, named in claims.items()}
 
 

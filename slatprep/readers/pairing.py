@@ -39,13 +39,15 @@ class _Row:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """The names of a source's files; `listing` lists its root."""
+    """The names of a source's files; `listing` lists its root.
+
+    Where the SLATs are one file, `roots` have its folder.
+    """
 
     source: PixieverseSource
     slat: SlatSource
     roots: SourceRoots
     listing: Listing
-    one_file: bool
     grids: Mapping[str, list[adapters.FoundField]]
     categories: Mapping[str, str]
     cases: Mapping[str, str]
@@ -93,30 +95,29 @@ def discover(
                 f"{slat.root}: {storage_of(slat.root).absent}; expected a folder of SLATs or an "
                 "HDF5 file"
             )
-        one_file = slat.root.is_file()
+        folder = slat.root.parent if slat.root.is_file() else slat.root
     except OSError as error:
         raise ConfigError(f"{error.filename}: cannot be looked at ({error.strerror})") from None
     places = [locate_grids(source, note) for source in sources]
     listings = [list_below(place) for place in places]
-    each = [_grids_of(*both, slat, one_file) for both in zip(sources, listings, strict=True)]
-    grids, slats = each[0], find_slats(slat, one_file)
+    each = [_grids_of(*both, slat) for both in zip(sources, listings, strict=True)]
+    grids, slats = each[0], find_slats(slat, folder != slat.root)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     rows = list(_rows(grids, slats, claims, each_sample=pixieverse.samples == "all"))
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
-    folder = slat.root.parent if one_file else slat.root
     contents, cases = contents_of(parameters), by_case(grids, slats)
     found = []
     for k, source in enumerate(sources):
         roots = SourceRoots(
             places[k], folder, contents, source.adapter, k, (), source.units, source.plausibility
         )
-        found.append(_Found(source, slat, roots, listings[k], one_file, each[k], categories, cases))
+        found.append(_Found(source, slat, roots, listings[k], each[k], categories, cases))
     return list(_pairs(rows, found))
 
 
 def _grids_of(
-    source: PixieverseSource, listing: Listing, slat: SlatSource, one_file: bool
+    source: PixieverseSource, listing: Listing, slat: SlatSource
 ) -> dict[str, list[adapters.FoundField]]:
     """Return the grids by `find_grids`; ConfigError if there are none."""
     grids = adapters.find_grids(source, listing)
@@ -125,7 +126,7 @@ def _grids_of(
     patterns = adapters.patterns_of(adapters.source_adapter(source.adapter), source)
     tried = tried_names(patterns, _known(sample=source.sample))
     # Plain voxels have the names that SLATs have.
-    ours = source.adapter == PixieverseSource.adapter and not one_file
+    ours = source.adapter == PixieverseSource.adapter and slat.root.is_dir()
     other = replace(source, root=slat.root)
     swapped = ours and adapters.find_grids(other, list_below(locate_grids(other)))
     hint = f"the roots are swapped: grids lie below {slat.root}" if swapped else hint_of(source)
@@ -307,7 +308,7 @@ def _unrecordable(path: str) -> str:
 
 def _no_slat(row: _Row, there: _Found) -> str:
     names = sorted({slat.slat_id for slat in row.slats} - {row.object_id}) or ["{id}"]
-    if there.one_file:
+    if there.roots.slat != there.slat.root:
         groups = " or ".join(f"group {fill(there.slat.group, {'id': name})}" for name in names)
         tried = f"{groups} in {there.slat.root}"
     else:

@@ -26,7 +26,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, needing
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
 from slatprep.readers.files import ArraySpec, load_source, npy_array, refusing, require_complete
@@ -76,9 +76,8 @@ class PhysXNet(SourceAdapter):
         text, points = load_source(beside, root, "description")
         vertices, _ = ply_points(text, beside)
         if len(rows) != len(vertices):
-            raise InputError(
-                path, f"has {len(rows)} rows", f"{len(vertices)}, a row a vertex of {beside.name}"
-            )
+            expected = f"{len(vertices)}, a row a vertex of {beside.name}"
+            raise InputError(path, f"has {len(rows)} rows", expected)
         return field_of_voxels(
             path,
             np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1),
@@ -223,11 +222,6 @@ def _voxels(meshes: list[Any], path: Place) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _trimesh() -> Any:
-    try:
+    with needing("trimesh", "meshes of parts need", "parts"):
         import trimesh
-    except ImportError as error:
-        raise ConfigError(
-            "meshes of parts need the package trimesh; install it with "
-            "`pip install 'slatprep[parts]'`"
-        ) from error
     return trimesh

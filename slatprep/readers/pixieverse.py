@@ -159,12 +159,10 @@ def read_prediction(
         bad[:, :2] |= values[:, :2] < 0
     if bad.any():
         row, column = _first(bad)
-        raise InputError(
-            path,
-            f"{PROPERTY_COLUMNS[column]} {values[row, column]:g} at voxel "
-            f"{tuple(np.argwhere(where)[row].tolist())}",
-            "finite numbers" + (", none of E and density below 0" if raw else ""),
-        )
+        voxel = tuple(np.argwhere(where)[row].tolist())
+        fault = f"{PROPERTY_COLUMNS[column]} {values[row, column]:g} at voxel {voxel}"
+        limit = ", none of E and density below 0" if raw else ""
+        raise InputError(path, fault, f"finite numbers{limit}")
     if not raw:
         require_prediction(path, values, material)
         return normalize.change_ranges(values, normalize.PIXIE_RANGES, normalization), material
@@ -186,9 +184,8 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
     bad = ~((values >= 0) & (values <= 1))  # written so that NaN is bad, too
     if bad.any():
         voxel = _first(bad)
-        raise InputError(
-            path, f"value {values[voxel]} at voxel {voxel}", "0 (empty) or 1 (occupied), or a bool"
-        )
+        expected = "0 (empty) or 1 (occupied), or a bool"
+        raise InputError(path, f"value {values[voxel]} at voxel {voxel}", expected)
     mask = np.ascontiguousarray(values > 0.5)
     if not mask.any():
         raise InputError(path, "the mask is empty", "an occupied voxel (a value above 0.5)")
@@ -212,11 +209,8 @@ def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
     known = (ids >= UNLABELLED) & (ids <= BACKGROUND) & (ids == np.rint(ids))
     if not known.all():
         voxel = _first(~known)
-        raise InputError(
-            path,
-            f"unknown class {ids[voxel]:g} at voxel {voxel}",
-            f"whole class ids from {UNLABELLED} to {BACKGROUND}",
-        )
+        expected = f"whole class ids from {UNLABELLED} to {BACKGROUND}"
+        raise InputError(path, f"unknown class {ids[voxel]:g} at voxel {voxel}", expected)
     return ids.astype(np.int8)
 
 
@@ -229,9 +223,8 @@ def _classes_of_scores(
     finite = np.isfinite(inside).all(axis=0)
     if not finite.all():
         voxel = tuple(np.argwhere(where)[np.argmin(finite)].tolist())
-        raise InputError(
-            path, f"a class score is NaN or infinite at voxel {voxel}", "finite scores"
-        )
+        fault = f"a class score is NaN or infinite at voxel {voxel}"
+        raise InputError(path, fault, "finite scores")
     top = inside.max(axis=0)
     best = inside.argmax(axis=0).astype(np.int8)
     # Where several classes share the highest score (all zero, say), taking the
@@ -252,11 +245,8 @@ def _annotated(
     unlabelled = occupancy & (material == UNLABELLED)
     annotated: NDArray[np.bool_] = occupancy & ~background & ~unlabelled
     if not annotated.any():
-        raise InputError(
-            path,
-            f"none of the {np.count_nonzero(occupancy)} occupied voxels is annotated",
-            "an occupied voxel of class 0 to 6",
-        )
+        fault = f"none of the {np.count_nonzero(occupancy)} occupied voxels is annotated"
+        raise InputError(path, fault, "an occupied voxel of class 0 to 6")
     _note(warnings, unlabelled, "occupied voxels have no class (-1); not annotated")
     # Without a mask what is background is not occupied, and of these there are none.
     empty, outside = occupancy & background, ~occupancy & ~background

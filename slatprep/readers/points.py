@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, SlatprepError
+from slatprep.errors import InputError, SlatprepError, needing
 from slatprep.readers.files import refusing
 from slatprep.records import Place
 
@@ -29,13 +29,8 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
     Vertices have at least numbers ``x``, ``y`` and ``z``. InputError if the file has none,
     SlatprepError if plyfile is not installed.
     """
-    try:
+    with needing("plyfile", "reading a PLY needs", "simulate", SlatprepError):
         import plyfile
-    except ImportError as error:
-        raise SlatprepError(
-            "reading a PLY needs the package plyfile; install it with "
-            "`pip install 'slatprep[simulate]'`"
-        ) from error
 
     def read(ply: bytes) -> Any:
         try:
@@ -72,7 +67,14 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
             for element, rows in zip(described.elements[:last], counts, strict=False):
                 start += rows * element.dtype(described.byte_order).itemsize
             return np.frombuffer(data, fields, counts[last], start), tuple(described.comments)
-        _require_small(data, start, slow, described.text)
+        if slow > _SLOW_VALUES or len(data) - start > _SLOW_BYTES:
+            raise ValueError(
+                f"it has {slow:,} values of text or with lists in {len(data) - start:,} bytes, and "
+                f"at most {_SLOW_VALUES:,} in {_SLOW_BYTES:,} are read; write it in binary, "
+                "without lists"
+            )
+        if described.text and re.compile(rb"[^\r\n]{%d}" % _LINE_BYTES).search(data, start):
+            raise ValueError(f"it has a line of {_LINE_BYTES:,} bytes and more")
         kept = read(_with_counts(header, counts[: last + 1]) + data[start:])
         return np.asarray(kept["vertex"].data), tuple(kept.comments)
 
@@ -110,15 +112,3 @@ def _sizes(properties: Sequence[Any]) -> tuple[list[int], bool]:
     lists = [hasattr(one, "len_dtype") for one in properties]
     kinds = [getattr(one, "len_dtype", one.val_dtype) for one in properties]
     return [np.dtype(kind).itemsize for kind in kinds], any(lists)
-
-
-def _require_small(data: bytes, start: int, values: int, text: bool) -> None:
-    """Raise ValueError if what plyfile would read value by value takes too long or too much."""
-    if values > _SLOW_VALUES or len(data) - start > _SLOW_BYTES:
-        raise ValueError(
-            f"it has {values:,} values of text or with lists in {len(data) - start:,} bytes, and "
-            f"at most {_SLOW_VALUES:,} in {_SLOW_BYTES:,} are read; write it in binary, without "
-            "lists"
-        )
-    if text and re.compile(rb"[^\r\n]{%d}" % _LINE_BYTES).search(data, start):
-        raise ValueError(f"it has a line of {_LINE_BYTES:,} bytes and more")

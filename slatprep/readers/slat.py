@@ -80,11 +80,10 @@ def _textures_of(shapes: Place) -> Place:
     folders = storage_of(textures).names()[1] if home.name == "shape_latents" else []
     found = [name for name in folders if name.endswith(like)]
     if len(found) != 1:
-        raise InputError(
-            shapes,
-            f"{len(found)} folders of texture latents go with it",
-            f"shape_latents/MODEL{like}/ID.npz and one pbr_latents/MODEL{like}/ below slat.root",
+        wanted = (
+            f"shape_latents/MODEL{like}/ID.npz and one pbr_latents/MODEL{like}/ below slat.root"
         )
+        raise InputError(shapes, f"{len(found)} folders of texture latents go with it", wanted)
     return textures / found[0]
 
 
@@ -144,9 +143,8 @@ def _with_texture(
     order = np.argsort(theirs)
     at = order[np.minimum(np.searchsorted(theirs, ours, sorter=order), len(order) - 1)]
     if len(ours) != len(theirs) or (theirs[at] != ours).any():
-        raise InputError(
-            texture, f"has other voxels than {path.name} of the shape", "latents of the same voxels"
-        )
+        fault = f"has other voxels than {path.name} of the shape"
+        raise InputError(texture, fault, "latents of the same voxels")
     (file,) = pbr.sources
     return replace(
         shape,
@@ -168,9 +166,8 @@ def checked_latents(
     Raises InputError that names place, value and row if they are not valid.
     """
     if len(coords) != len(feats):
-        raise InputError(
-            where, f"{len(coords)} rows of coords but {len(feats)} of feats", "one latent per voxel"
-        )
+        fault = f"{len(coords)} rows of coords but {len(feats)} of feats"
+        raise InputError(where, fault, "one latent per voxel")
     if len(coords) == 0:
         raise InputError(where, "the SLAT is empty", "at least one voxel")
     warnings: list[str] = []
@@ -206,32 +203,22 @@ def check_coords(
         batch = coords[:, 0]
         if batch.any():
             row = int(np.argmax(batch != 0))
-            raise InputError(
-                where,
-                f"batch index {batch[row]} in row {row}: more than one asset, or not the first",
-                "one asset per file, batch index 0 throughout",
-            )
+            fault = f"batch index {batch[row]} in row {row}: more than one asset, or not the first"
+            raise InputError(where, fault, "one asset per file, batch index 0 throughout")
         coords = coords[:, 1:]
     outside = ((coords < 0) | (coords >= side)).any(axis=1)
     if outside.any():
         row = int(np.argmax(outside))
-        raise InputError(
-            where,
-            f"coordinate {tuple(coords[row].tolist())} in row {row} is out of range",
-            f"coordinates in 0..{side - 1}{whose}",
-        )
+        fault = f"coordinate {tuple(coords[row].tolist())} in row {row} is out of range"
+        raise InputError(where, fault, f"coordinates in 0..{side - 1}{whose}")
     voxels = np.ascontiguousarray(coords).astype(np.uint8)
     flat = flat_index(voxels, side)
     counts = np.bincount(flat)
     if (counts > 1).any():
         rows = np.flatnonzero(counts[flat] > 1)
         first, second = np.flatnonzero(flat == flat[rows[0]])[:2]
-        raise InputError(
-            where,
-            f"coordinate {tuple(voxels[first].tolist())} occurs twice, in rows {first} and "
-            f"{second}",
-            "each coordinate once",
-        )
+        twice = f"coordinate {tuple(voxels[first].tolist())} occurs twice"
+        raise InputError(where, f"{twice}, in rows {first} and {second}", "each coordinate once")
     return voxels
 
 
@@ -245,9 +232,6 @@ def _check_feats(
     finite = np.isfinite(latents)
     if not finite.all():
         row, column = np.argwhere(~finite)[0].tolist()
-        raise InputError(
-            where,
-            f"feats is {feats[row, column]} in row {row}, channel {column}",
-            "finite latents that float32 can hold",
-        )
+        fault = f"feats is {feats[row, column]} in row {row}, channel {column}"
+        raise InputError(where, fault, "finite latents that float32 can hold")
     return latents

@@ -235,11 +235,9 @@ def _by_file(
                     "every object, with all its views, in one"
                 )
     if not splits:
-        raise InputError(
-            path,
-            f"has none of the dataset's {len(objects):,} objects",
-            f"ids such as {next(iter(sorted(objects)), 'none: there is no object')}",
-        )
+        example = min(objects, default="none: there is no object")
+        fault = f"has none of the dataset's {len(objects):,} objects"
+        raise InputError(path, fault, f"ids such as {example}")
     if lists.keys() == {"test"}:
         splits = _around(splits, objects, shares)
     unlisted = tuple(object_id for object_id in sorted(objects) if object_id not in splits)
