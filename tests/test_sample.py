@@ -18,10 +18,8 @@ NEAREST = SampleParameters(method="nearest")
 def _field() -> MaterialField:
     """Two voxels with values of their own."""
     voxels = np.array([[10, 10, 10], [20, 10, 10]], dtype=np.uint8)
-    occupancy = np.zeros((64, 64, 64), dtype=bool)
-    occupancy[tuple(voxels.T)] = True
     return MaterialField(
-        occupancy,
+        occupancy_of(voxels),
         voxels,
         np.array([1, 4], dtype=np.uint8),
         np.array([[2e11, 7800, 0.3], [1e5, 1000, 0.45]], dtype=np.float32),
@@ -44,18 +42,16 @@ def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
 def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values():
     # One voxel of class 0 in a block of class 3: looked at slightly off its
     # centre, its neighbours outvote it.
-    block = np.argwhere(np.ones((5, 5, 5), dtype=bool)) + 30
+    block = np.argwhere(np.ones((5, 5, 5), dtype=bool)).astype(np.uint8) + 30
     # The voxel to be taken comes first: row 0 is a row as any other.
     block = np.roll(block, -int(np.flatnonzero((block == [31, 32, 32]).all(axis=1))[0]), axis=0)
     classes = np.where((block == 32).all(axis=1), 0, 3).astype(np.uint8)
     properties = np.stack([np.arange(125) + 1.0] * 3, axis=1).astype(np.float32)
-    occupancy = np.zeros((64, 64, 64), dtype=bool)
-    occupancy[tuple(block.T)] = True
-    field = MaterialField(occupancy, block.astype(np.uint8), classes, properties)
+    field = MaterialField(occupancy_of(block), block, classes, properties)
     shift = make_transform(np.eye(3), np.array([0.3, 0, 0]) / 64)
-    coords = np.array([[32, 32, 32]], dtype=np.uint8)  # looks at (31.7, 32, 32)
-    assert sample(field, places_of(voxel_centres(coords), shift), NEAREST).material.tolist() == [0]
-    voted = sample(field, places_of(voxel_centres(coords), shift), SampleParameters())
+    places = places_of(voxel_centres(np.array([[32, 32, 32]], np.uint8)), shift)  # (31.7, 32, 32)
+    assert sample(field, places, NEAREST).material.tolist() == [0]
+    voted = sample(field, places, SampleParameters())
     assert voted.material.tolist() == [3]
     np.testing.assert_array_equal(voted.properties[0], properties[0])
     np.testing.assert_allclose(voted.distance, [0.7], rtol=1e-5)
@@ -93,24 +89,24 @@ def _said(material: list[int], modulus: list[float], ratio: list[float]) -> Anno
 
 
 def test_annotations_merge_to_mean_spread_and_votes():
-    """Four voxels: all agree; three differ; a tie of classes; one annotation alone reaches it."""
-    one = _said([0, 1, 4, 255], [1e6, 1e5, 1e6, np.nan], [0.3, 0.3, 0.2, np.nan])
-    two = _said([0, 1, 2, 255], [1e6, 1e6, 1e6, np.nan], [0.3, 0.3, 0.3, np.nan])
-    three = _said([0, 3, 255, 5], [1e6, 1e7, np.nan, 2e9], [0.3, 0.3, np.nan, 0.4])
+    """Five voxels: all agree; three differ; a tie of classes; one annotation reaches it; none."""
+    nan = np.nan
+    one = _said([0, 1, 4, 255, 255], [1e6, 1e5, 1e6, nan, nan], [0.3, 0.3, 0.2, nan, nan])
+    two = _said([0, 1, 2, 255, 255], [1e6, 1e6, 1e6, nan, nan], [0.3, 0.3, 0.3, nan, nan])
+    three = _said([0, 3, 255, 5, 255], [1e6, 1e7, nan, 2e9, nan], [0.3, 0.3, nan, 0.4, nan])
     made = merge([one, two, three], PROPERTIES)
-    np.testing.assert_allclose(made.properties[:, 0], [1e6, 1e6, 1e6, 2e9], rtol=1e-6)
-    np.testing.assert_allclose(made.properties[:, 2], [0.3, 0.3, 0.25, 0.4], rtol=1e-6)
-    assert made.material.tolist() == [0, 1, 2, 5]
-    assert made.valid.all()
+    np.testing.assert_allclose(made.properties[:, 0], [1e6, 1e6, 1e6, 2e9, nan], rtol=1e-6)
+    np.testing.assert_allclose(made.properties[:, 2], [0.3, 0.3, 0.25, 0.4, nan], rtol=1e-6)
+    assert made.material.tolist() == [0, 1, 2, 5, UNANNOTATED]
+    assert made.valid.tolist() == [True] * 4 + [False]
     np.testing.assert_allclose(made.spread[:3, 0], [0, np.std([5, 6, 7]), 0], rtol=1e-6)
     np.testing.assert_allclose(made.spread[:3, 2], [0, 0, 0.05], atol=1e-7)
     assert not made.spread[0].any()
-    assert np.isnan(made.spread[3]).all()
-    np.testing.assert_allclose(made.votes, [1, 2 / 3, 1 / 2, 1], rtol=1e-6)
+    assert np.isnan(made.spread[3:]).all()
+    np.testing.assert_allclose(made.votes, [1, 2 / 3, 1 / 2, 1, 0], rtol=1e-6)
     # Half where a property is off: 1e5 is a tenth of 1e6, and 0.3 is 0.05 off 0.25, just a fifth.
-    np.testing.assert_allclose(
-        made.confidence, 0.8 * np.array([1, (0.5 + 1) / 3, 1 / 2, 1]), rtol=1e-6
-    )
+    likely = 0.8 * np.array([1, (0.5 + 1) / 3, 1 / 2, 1, 0])
+    np.testing.assert_allclose(made.confidence, likely, rtol=1e-6)
 
 
 def test_what_an_annotation_does_not_know_is_left_to_the_others():
@@ -133,16 +129,6 @@ def test_what_an_annotation_does_not_know_is_left_to_the_others():
     assert made.votes.tolist() == [1, 1, 0]
     # A density of 4e3 is 2.5 times the mean: half. Of the second voxel no modulus is near.
     np.testing.assert_allclose(made.confidence, 0.8 * np.array([2.5 / 3, 1.5 / 3, 0]), rtol=1e-6)
-
-
-def test_voxels_that_no_annotation_reaches_stay_without_labels():
-    nowhere = _said([255], [np.nan], [np.nan])
-    made = merge([nowhere, nowhere], PROPERTIES)
-    assert not made.valid.any()
-    assert made.material.tolist() == [UNANNOTATED]
-    assert np.isnan(made.properties).all()
-    assert np.isnan(made.spread).all()
-    assert made.votes.tolist() == made.confidence.tolist() == [0.0]
 
 
 def test_a_voxel_with_a_class_and_without_one_of_the_properties_is_not_valid():

@@ -23,16 +23,10 @@ SOURCE = Path(trellis_latents.__file__)
 
 def test_it_is_python_3_10_and_imports_nothing_of_ours():
     tree = ast.parse(SOURCE.read_text("utf-8"), feature_version=(3, 10))
-    modules = {
-        alias.name.partition(".")[0]
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Import)
-        for alias in node.names
-    } | {
-        (node.module or "").partition(".")[0]
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom)
-    }
+    nodes = list(ast.walk(tree))
+    plain = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    named = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+    modules = {name.partition(".")[0] for name in [*plain, *named]}
     brought = {"numpy", "PIL", "torch", "trellis", "trellis2", "inference"}
     assert modules <= brought | set(sys.stdlib_module_names), modules
     # Names that Python 3.11 added to modules used here.
@@ -83,10 +77,8 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(
     monkeypatch.setitem(sys.modules, "trellis.pipelines", module)
     words = [*map(str, images), "--out", str(tmp_path / "slat"), "--seed", "7"]
     assert trellis_latents.main(words) == 1  # The cup has no foreground; the bear is done.
-    assert [path.name for path in sorted((tmp_path / "slat").iterdir())] == [
-        "bear.json",
-        "bear.npz",
-    ]
+    made = sorted(path.name for path in (tmp_path / "slat").iterdir())
+    assert made == ["bear.json", "bear.npz"]
     assert pipeline.device == "device cuda"
     session = extract.Session(Pipeline(torch), torch, {})
     list(extract.extract(session, extract.list_extractions(images[1:], tmp_path / "b", [7], False)))

@@ -76,21 +76,10 @@ def refusing(
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """What an array in a source file may look like.
+    """What an array in a source file may look like: its shape, and its numpy dtype kind.
 
-    Attributes
-    ----------
-    shapes : tuple of shapes
-        Allowed shapes. In a shape, None stands for 0 to `max_rows` rows, a range for its
-        sizes. Empty: any shape of at most `max_items` items.
-    kinds : str
-        Allowed numpy dtype kinds.
-    max_items : int
-        Bound on the number of items where `shapes` is empty.
-    note : str
-        What an error adds to the allowed shapes.
-    max_rows : int
-        Bound on a size that is None in `shapes`.
+    In a shape, None stands for 0 to `max_rows` rows, a range for its sizes. Without `shapes`, any
+    of at most `max_items` items will do. An error adds `note` to the allowed shapes.
     """
 
     shapes: tuple[tuple[int | range | None, ...], ...]

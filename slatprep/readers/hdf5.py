@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.readers.files import ArraySpec, load_source, refusing
-from slatprep.readers.patterns import match
+from slatprep.readers.files import ArraySpec, refusing
+from slatprep.readers.patterns import components_of, match
 from slatprep.records import Place, SourceFile
 from slatprep.storage.chunks import place_chunk
 from slatprep.storage.place import storage_of
@@ -35,35 +35,42 @@ SUFFIXES = (".h5", ".hdf5")
 _DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3
 _FILTER_NAMES = {_DEFLATE: "gzip", _SHUFFLE: "shuffle", _FLETCHER32: "fletcher32"}
 _UNREADABLE = "is no readable HDF5 file"
+_EXPECTED = "an intact HDF5 file with datasets {}; copy or make it again"
 _WRITTEN = "a completely written dataset; make it again"
 _MAX_CHUNKS = 65_536
 _MAX_CHUNK_BYTES = 2**26
 
 
-def load_datasets(
-    path: Place, root: Place, group: str, specs: Mapping[str, ArraySpec], role: str = "slat"
-) -> tuple[dict[str, NDArray[Any]], SourceFile]:
-    """Read the named datasets of a group, and hash the file.
+def hdf5_arrays(
+    data: bytes, where: Place, specs: Mapping[str, ArraySpec]
+) -> dict[str, NDArray[Any]]:
+    """Read the named datasets of an HDF5 file; errors call it `where`, see `group_arrays`."""
+    import h5py
 
-    An empty `group` is the file's root. InputError if the file leaves `root` or cannot be read, or
-    if a dataset is missing or not as specified.
+    with (
+        refusing(where, _UNREADABLE, _EXPECTED.format(", ".join(specs))),
+        h5py.File(h5py.h5f.open_file_image(data)) as file,
+    ):
+        return group_arrays(file, where, "", specs)
+
+
+def load_group(
+    path: Place, root: Place, group: str, specs: Mapping[str, ArraySpec]
+) -> tuple[dict[str, NDArray[Any]], SourceFile]:
+    """Read the named datasets of a group of a file that many assets share, and hash the file.
+
+    InputError if the file leaves `root` or cannot be read, or as `group_arrays`.
     """
     import h5py
 
-    where = f"{path} [{group}]" if group else path
-    expected = f"an intact HDF5 file with datasets {', '.join(specs)}; copy or make it again"
-    with refusing(where, _UNREADABLE, expected):
-        if group:
-            located, name = storage_of(root).locate(path)
-            with (
-                h5py.File(storage_of(located).on_disk(), "r", locking=False) as file,
-                reading(file.id.get_vfd_handle(), str(path)),
-            ):
-                source = _hash_shared(file.id.get_vfd_handle(), name)
-                return group_arrays(file, path, group, specs), source
-        data, source = load_source(path, root, role)
-        with h5py.File(h5py.h5f.open_file_image(data)) as file:
-            return group_arrays(file, path, group, specs), source
+    located, name = storage_of(root).locate(path)
+    with (
+        refusing(f"{path} [{group}]", _UNREADABLE, _EXPECTED.format(", ".join(specs))),
+        h5py.File(storage_of(located).on_disk(), "r", locking=False) as file,
+        reading(file.id.get_vfd_handle(), str(path)),
+    ):
+        source = _hash_shared(file.id.get_vfd_handle(), name)
+        return group_arrays(file, path, group, specs), source
 
 
 def group_arrays(
@@ -107,11 +114,11 @@ def find_groups(
         refusing(path, _UNREADABLE, "groups named by asset"),
         h5py.File(storage_of(file).on_disk(), "r", locking=False) as groups,
     ):
-        yield from _walk_groups(groups, pattern.strip("/").split("/"), dict(known), "")
+        yield from _walk_groups(groups, components_of(pattern.strip("/")), dict(known), "")
 
 
 def _walk_groups(
-    group: h5py.Group, components: list[str], known: dict[str, str], prefix: str
+    group: h5py.Group, components: tuple[str, ...], known: dict[str, str], prefix: str
 ) -> Iterator[tuple[dict[str, str], str]]:
     import h5py
 

@@ -124,7 +124,7 @@ def _grids_of(
     if grids:
         return grids
     patterns = adapters.patterns_of(adapters.source_adapter(source.adapter), source)
-    tried = tried_names(patterns, _known(sample=source.sample))
+    tried = tried_names(patterns, {"sample": source.sample})
     # Plain voxels have the names that SLATs have.
     ours = source.adapter == PixieverseSource.adapter and slat.root.is_dir()
     other = replace(source, root=slat.root)
@@ -237,7 +237,8 @@ def _pair_of(
         if len(grids) > 1:
             problems.append(adapters.several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
-            known = _known(id=row.object_id, sample=grids[0].sample or source.sample)
+            sample = grids[0].sample or source.sample
+            known = {"id": row.object_id} | ({"sample": sample} if sample else {})
             if source.adapter == "pixieverse":
                 mask = _find_one(there, source.mask, known, "mask", problems)
                 bounds = _find_one(there, source.bounds, known, "bounds", problems)
@@ -249,13 +250,11 @@ def _pair_of(
                     tried = fill(source.transform, known)
                     problems.append(f"no transform for id {row.object_id!r}; looked for {tried}")
     else:
-        tried = tried_names(source.grid, _known(id="{id}", sample=source.sample))
-        problems.append(f"no grid for id {row.object_id!r}; looked for {tried}")
-        problems.append(_case(row, there, "grid"))
+        tried = tried_names(source.grid, {"id": "{id}", "sample": source.sample})
+        problems += _lacking(row, there, "grid", tried)
     found = [slat for slat in row.slats if slat.path]
     if not found and not any(grid.problem for grid in grids):
-        problems.append(_no_slat(row, there))
-        problems.append(_case(row, there, "SLAT"))
+        problems += _lacking(row, there, "SLAT", _tried_slats(row, there))
     elif len(found) > 1:
         files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
         problems.append(
@@ -283,10 +282,11 @@ def _pair_of(
     )
 
 
-def _case(row: _Row, there: _Found, side: str) -> str:
-    """Say that the other side has an id in other letters' case; empty where it has not."""
-    other = there.cases.get(row.object_id, "")
-    return f"a {side} is called {other!r}: rename one, or join them with --map" if other else ""
+def _lacking(row: _Row, there: _Found, side: str, tried: str) -> Iterator[str]:
+    """Say that a side is missing, and whether it has the id in other letters' case."""
+    yield f"no {side} for id {row.object_id!r}; looked for {tried}"
+    if other := there.cases.get(row.object_id):
+        yield f"a {side} is called {other!r}: rename one, or join them with --map"
 
 
 def _name_problems(row: _Row) -> Iterator[str]:
@@ -306,14 +306,12 @@ def _unrecordable(path: str) -> str:
     return f"{path}: its name is no UTF-8, so that no record can hold it; rename it"
 
 
-def _no_slat(row: _Row, there: _Found) -> str:
+def _tried_slats(row: _Row, there: _Found) -> str:
     names = sorted({slat.slat_id for slat in row.slats} - {row.object_id}) or ["{id}"]
     if there.roots.slat != there.slat.root:
         groups = " or ".join(f"group {fill(there.slat.group, {'id': name})}" for name in names)
-        tried = f"{groups} in {there.slat.root}"
-    else:
-        tried = "; ".join(tried_names(there.slat.pattern, {"id": name}) for name in names)
-    return f"no SLAT for id {row.object_id!r}; looked for {tried}"
+        return f"{groups} in {there.slat.root}"
+    return "; ".join(tried_names(there.slat.pattern, {"id": name}) for name in names)
 
 
 def _find_one(
@@ -330,8 +328,3 @@ def _find_one(
         if paths:
             return there.roots.pixieverse / paths[0]
     return None
-
-
-def _known(**fields: str) -> dict[str, str]:
-    """Return the fields of a pattern that have a value."""
-    return {name: value for name, value in fields.items() if value}

@@ -59,7 +59,7 @@ def find_files(
     arbitrary. Broken links are included, so that their reader reports them. `NAME` is not checked.
     ConfigError if the pattern makes no sense or the root cannot be listed.
     """
-    components = _components(pattern)
+    components = components_of(pattern)
     # One name needs no search. Most patterns stand for one: that of a file beside a grid.
     if "*" not in (literal := fill(pattern, known)):
         if names.is_file(literal):
@@ -72,7 +72,7 @@ def find_files(
 
 
 @lru_cache(maxsize=64)
-def _components(pattern: str) -> tuple[str, ...]:
+def components_of(pattern: str) -> tuple[str, ...]:
     """Split a pattern at its slashes; raise ConfigError where it makes no sense."""
     components = tuple(pattern.split("/"))
     if pattern.startswith("/") or any(part in ("", ".", "..") for part in components):
@@ -80,14 +80,21 @@ def _components(pattern: str) -> tuple[str, ...]:
             f"pattern {pattern!r} is not a path below its root; write it relative, without '..'"
         )
     for component in components:
-        _parts(component)
+        names = [part for part in _VARIABLE.findall(component) if part != "*"]
+        for name in names:
+            where = f"pattern component {component!r} names {name}"
+            if name[1:-1] not in FIELDS:
+                known = ", ".join(f"{{{field}}}" for field in FIELDS)
+                raise ConfigError(f"{where}; fields are {known}")
+            if names.count(name) > 1:
+                raise ConfigError(f"{where} twice; name it once")
     return components
 
 
 def fill(pattern: str, known: Mapping[str, str]) -> str:
-    """Return a pattern with its known fields filled in and a ``*`` for the others."""
+    """Return a pattern with its known fields filled in and a ``*`` for the others, also empty."""
     for field in FIELDS:
-        pattern = pattern.replace(f"{{{field}}}", known.get(field, "*"))
+        pattern = pattern.replace(f"{{{field}}}", known.get(field) or "*")
     return pattern
 
 
@@ -96,22 +103,22 @@ def match(component: str, known: Mapping[str, str], name: str) -> dict[str, str]
 
     A field takes at least one character, ``*`` also none. Where several matches are possible, the
     leftmost takes most: ``{id}_{view}`` splits ``a_b_c`` into ``a_b`` and ``c``. Time is linear
-    in the name. ConfigError if the component makes no sense.
+    in the name.
     """
     return _fields(*_split(component, known), name)
 
 
 def _split(component: str, known: Mapping[str, str]) -> tuple[list[str], list[str]]:
     """Return a component's literal texts, known fields filled in, and the fields between them."""
-    texts, variables = [""], []
-    for part in _parts(component):
-        if part in known:
-            texts[-1] += known[part]
-        elif part in FIELDS or part == "*":
-            variables.append(part)
-            texts.append("")
+    first, *others = _VARIABLE.split(component)
+    texts, variables = [first], list[str]()
+    for variable, text in zip(others[::2], others[1::2], strict=True):
+        name = variable.strip("{}")
+        if name in known:
+            texts[-1] += known[name] + text
         else:
-            texts[-1] += part[1:]
+            variables.append(name)
+            texts.append(text)
     return texts, variables
 
 
@@ -133,25 +140,6 @@ def _fields(texts: list[str], variables: list[str], name: str) -> dict[str, str]
     fields[variables[0]] = name[begin:stop]
     fields.pop("*", None)
     return fields if all(fields.values()) else None
-
-
-@lru_cache(maxsize=64)
-def _parts(component: str) -> tuple[str, ...]:
-    """Split a component into fields by name, ``*``, and other text with a blank before it."""
-    parts: list[str] = []
-    for part in _VARIABLE.split(component):
-        if not part.startswith("{"):
-            parts.append(part if part == "*" else f" {part}")
-        elif part[1:-1] not in FIELDS:
-            raise ConfigError(
-                f"pattern component {component!r} names {part}; "
-                f"fields are {', '.join(f'{{{name}}}' for name in FIELDS)}"
-            )
-        elif part[1:-1] in parts:
-            raise ConfigError(f"pattern component {component!r} names {part} twice; name it once")
-        else:
-            parts.append(part[1:-1])
-    return tuple(parts)
 
 
 def _walk(

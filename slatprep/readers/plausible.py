@@ -135,9 +135,11 @@ def oddity_of(part: Part, units: Units) -> str:
 def is_usual(part: Part) -> bool:
     """Whether PixieVerse has such values in a class."""
     least, most = _USUAL.get(part.name, _USUAL_MODULUS)
-    stiff = math.isnan(part.modulus) or least <= part.modulus <= most
     lo, hi = _USUAL_DENSITY
-    return stiff and (math.isnan(part.density) or lo <= part.density <= hi)
+    # What is NaN is beyond no end.
+    return not (
+        part.modulus < least or part.modulus > most or part.density < lo or part.density > hi
+    )
 
 
 def is_physical(part: Part) -> bool:

@@ -14,7 +14,7 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import SlatSource
 from slatprep.readers.contents import ENOUGH, in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
-from slatprep.readers.hdf5 import SUFFIXES, load_datasets
+from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays, load_group
 from slatprep.records import RESOLUTION, TRELLIS, LatentSpace, Place, SourceFile, StructuredLatents
 from slatprep.records.trellis2 import PBR_MEAN, PBR_STD, SHAPE_MEAN, SHAPE_STD
 from slatprep.storage.place import storage_of
@@ -124,11 +124,12 @@ def read_slat(
     specs = {"coords": _COORDS, "feats": feats}
     if texture := texture_of(path, space):
         return _with_texture(path, texture, root, space)
-    if group or path.suffix.lower() in SUFFIXES:
-        arrays, source = load_datasets(path, root, group, specs)
+    if group:
+        arrays, source = load_group(path, root, group, specs)
     else:
         data, source = load_source(path, root, "slat")
-        arrays = npz_arrays(data, path, specs)
+        read = hdf5_arrays if path.suffix.lower() in SUFFIXES else npz_arrays
+        arrays = read(data, path, specs)
     where = f"{path} [{group}]" if group else path
     return checked_latents(arrays["coords"], arrays["feats"], where, (source,), space)
 

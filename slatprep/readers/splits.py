@@ -24,13 +24,7 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Shares:
-    """Expected shares of the objects in each split.
-
-    Raises
-    ------
-    ConfigError
-        Unless they are at least 0 and add up to 1.
-    """
+    """Expected shares of the objects in each split; ConfigError unless they add up to 1."""
 
     train: float = 0.8
     val: float = 0.1
@@ -55,14 +49,8 @@ def position_of(object_id: str) -> float:
 def split_of(object_id: str, shares: Shares = Shares()) -> Split:
     """Return the split of an object, by its id alone.
 
-    All views of an object share a split. An object stays in its split when the dataset grows.
-
-    Parameters
-    ----------
-    object_id : str
-        PixieVerse id, ``asset/object_id`` of the store.
-    shares : Shares
-        Shares of the splits.
+    The id is ``asset/object_id`` of the store, so that all views of an object share a split. An
+    object stays in its split when the dataset grows.
     """
     position = position_of(object_id)
     if position < shares.train:
@@ -103,16 +91,10 @@ _FORMS = (
 
 @dataclass(frozen=True)
 class Assignment:
-    """Which split each object of a dataset is in.
+    """Which split each object of a dataset is in, by its id.
 
-    Attributes
-    ----------
-    splits : dict of str to {"train", "val", "test"}
-        By object id.
-    unknown : tuple of str
-        Ids of a file that the dataset does not have.
-    unlisted : tuple of str
-        Objects that no list of the file names; they are in no split.
+    Of a file of lists, `unknown` are ids that the dataset does not have, and `unlisted` the objects
+    that no list names; these are in no split.
     """
 
     splits: dict[str, Split]

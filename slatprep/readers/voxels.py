@@ -13,7 +13,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -27,7 +27,7 @@ from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
-from slatprep.readers.hdf5 import SUFFIXES, load_datasets
+from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
 from slatprep.storage.chunks import array_form, read_chunks
@@ -112,15 +112,13 @@ class PlainVoxels(SourceAdapter):
         said = _parsed(text, str(root / DESCRIPTION))
         specs = {"voxels": _VOXELS, **{one.name: _COLUMN for one in said.properties}}
         specs |= {"material": _COLUMN} if said.classes else {}
-        if path.suffix.lower() in SUFFIXES:
-            arrays, file = load_datasets(path, root, "", specs, role="grid")
-        else:
-            data, file = files.load_source(path, root, "grid")
-            if files.is_hierarchy(path):
-                arrays = _group_arrays(data, path, specs, said.empty_chunks)
-            else:
-                read = _ply_arrays if path.suffix.lower() == ".ply" else files.npz_arrays
-                arrays = read(data, path, specs)
+        data, file = files.load_source(path, root, "grid")
+        readers: dict[str, Callable[..., dict[str, NDArray[Any]]]] = {
+            ".zarr": partial(_group_arrays, empty=said.empty_chunks),
+            ".ply": _ply_arrays,
+            **dict.fromkeys(SUFFIXES, hdf5_arrays),
+        }
+        arrays = readers.get(path.suffix.lower(), files.npz_arrays)(data, path, specs)
         columns: list[Any] = [arrays[one.name] for one in said.properties]
         lengths = {len(column) for column in arrays.values()}
         if len(lengths) > 1:

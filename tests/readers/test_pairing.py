@@ -69,6 +69,8 @@ def test_several_samples_need_a_choice(find):
 
     (pair,) = find([grid("b")], ["b.npz"], pixieverse={"sample": "1"})[1:]
     assert "looked for {id}/sample_1/material_grid.npy" in pair.problem
+    with pytest.raises(ValueError, match="samples = 'one' where `sample` names"):
+        find(pixieverse={"samples": "merge", "sample": "1"})
 
 
 def test_several_samples_by_number(find):
@@ -94,11 +96,6 @@ def test_each_sample_with_each_view(find):
     ]
     assert {pair.view for pair in pairs} == {"left", "right"}
     assert all(not pair.problem for pair in pairs)
-
-
-def test_one_sample_is_named_or_all_are_asked_for(find):
-    with pytest.raises(ValueError, match="samples = 'one' where `sample` names"):
-        find([grid("a")], ["a.npz"], pixieverse={"samples": "merge", "sample": "1"})
 
 
 def test_missing_partners_are_yielded_with_what_was_looked_for(find, tmp_path):
