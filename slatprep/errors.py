@@ -76,12 +76,10 @@ class UnknownAssetError(StoreError, ConfigError):
 
 
 @contextmanager
-def needing(
-    package: str, what: str, extra: str, kind: type[SlatprepError] = ConfigError
-) -> Iterator[None]:
+def needing(what: str, extra: str, kind: type[SlatprepError] = ConfigError) -> Iterator[None]:
     """Import an optional package; an error that says how to install it where that fails."""
     try:
         yield
     except ImportError as error:
         way = f"install it with `pip install 'slatprep[{extra}]'`"
-        raise kind(f"{what} the package {package}; {way}") from error
+        raise kind(f"{what} the package {error.name}; {way}") from error

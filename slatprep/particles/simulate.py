@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.errors import ConfigError, SlatprepError
+from slatprep.errors import SlatprepError, needing
 from slatprep.records import MATERIAL_CLASSES
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 
@@ -212,13 +212,8 @@ def preferred_device() -> str:
 
 
 def _engine() -> tuple[Any, Any]:
-    try:
+    with needing("simulation needs", "simulate"):
         import newton
         import warp
-    except ImportError as error:
-        raise ConfigError(
-            f"simulation needs the package {error.name}; install it with "
-            "`pip install 'slatprep[simulate]'`"
-        ) from error
     warp.config.log_level = warp.LOG_WARNING  # Or each kernel that it loads is a line on stdout.
     return newton, warp

@@ -222,6 +222,6 @@ def _voxels(meshes: list[Any], path: Place) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _trimesh() -> Any:
-    with needing("trimesh", "meshes of parts need", "parts"):
+    with needing("meshes of parts need", "parts"):
         import trimesh
     return trimesh

@@ -29,7 +29,7 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
     Vertices have at least numbers ``x``, ``y`` and ``z``. InputError if the file has none,
     SlatprepError if plyfile is not installed.
     """
-    with needing("plyfile", "reading a PLY needs", "simulate", SlatprepError):
+    with needing("reading a PLY needs", "simulate", SlatprepError):
         import plyfile
 
     def read(ply: bytes) -> Any:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -113,12 +113,14 @@ class PlainVoxels(SourceAdapter):
         specs = {"voxels": _VOXELS, **{one.name: _COLUMN for one in said.properties}}
         specs |= {"material": _COLUMN} if said.classes else {}
         data, file = files.load_source(path, root, "grid")
-        readers: dict[str, Callable[..., dict[str, NDArray[Any]]]] = {
-            ".zarr": partial(_group_arrays, empty=said.empty_chunks),
-            ".ply": _ply_arrays,
-            **dict.fromkeys(SUFFIXES, hdf5_arrays),
-        }
-        arrays = readers.get(path.suffix.lower(), files.npz_arrays)(data, path, specs)
+        kind = path.suffix.lower()
+        if kind in SUFFIXES:
+            arrays = hdf5_arrays(data, path, specs)
+        elif files.is_hierarchy(path):
+            arrays = _group_arrays(data, path, specs, said.empty_chunks)
+        else:
+            read = _ply_arrays if kind == ".ply" else files.npz_arrays
+            arrays = read(data, path, specs)
         columns: list[Any] = [arrays[one.name] for one in said.properties]
         lengths = {len(column) for column in arrays.values()}
         if len(lengths) > 1:

@@ -8,6 +8,17 @@ Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube [-0.5
 ``i`` centred at ``(i + 0.5) / 64 - 0.5`` on each axis.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from dataclasses import field as with_default
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import MaxLen, MinLen
+from numpy.typing import NDArray
+
 from slatprep.records.alignment import (
     Agreement,
     Alignment,
@@ -29,14 +40,6 @@ from slatprep.records.json_types import (
     Number,
     Share,
     one_of,
-)
-from slatprep.records.results import (
-    Annotation,
-    Contribution,
-    Failed,
-    Finished,
-    Normalization,
-    PropertyRange,
 )
 from slatprep.records.sources import (
     FACTORS,
@@ -87,3 +90,104 @@ from slatprep.records.tables import (
     labels_of,
     words_of,
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Annotation:
+    """Class and properties at every SLAT voxel, in SI units.
+
+    ``properties`` is (N, P) float32, columns as in the field, NaN where not valid; ``material``
+    (N,) uint8, 255 where not valid; ``valid`` (N,) bool. ``distance`` (N,) float32 is the distance
+    to the annotation used, in voxels of the PixieVerse frame. ``place`` (N, 3) float32 is the
+    voxel's place in that frame. ``confidence`` (N,) float32 is the probability that the class is
+    right, 0 where not valid, None until judged.
+
+    A merged annotation has ``spread`` (N, P) float32, the standard deviation of each property, in
+    log10 where it is normalised so, NaN where fewer than two are valid. Its ``votes`` (N,) float32
+    are the share of valid annotations that give its class, 0 without any.
+    """
+
+    properties: NDArray[np.float32]
+    material: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    distance: NDArray[np.float32]
+    place: NDArray[np.float32]
+    confidence: NDArray[np.float32] | None = None
+    spread: NDArray[np.float32] | None = None
+    votes: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Contribution:
+    """One of several annotations of an object, and its part in the merge."""
+
+    sample: str
+    """Which it is."""
+    sources: tuple[Count, ...]
+    """Its files, by their positions among the record's sources."""
+    left_out: str = ""
+    """Why it is no part of the merge; empty where it is."""
+    alignment: Alignment | None = None
+    """The transform from its own frame; null where it could not be read."""
+    judgement: Judgement | None = None
+    """What that alignment is worth."""
+
+
+@dataclass(frozen=True)
+class PropertyRange:
+    """How to map a property to [-1, 1].
+
+    ``lo`` and ``hi`` are in the mapped unit: log10 of the SI value if ``log10``, else the SI value
+    itself.
+    """
+
+    name: PropertyName
+    log10: bool
+    lo: float
+    hi: float
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """The range of every property, in the order of the columns, and the origin of the ranges.
+
+    ``source`` is ``dataset``, ``p1-p99`` or other percentiles of it, ``pixie``, or the name of a
+    file. Those of the dataset may be ``of train by`` a rule of splits.
+    """
+
+    ranges: Annotated[tuple[PropertyRange, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """An asset that went through all stages; properties in SI units.
+
+    If merged of several annotations, it has a contribution for each. It also has the files of all,
+    with their digests by role for the asset's key, and the fields after the first. Field and
+    alignment are the first one's.
+    """
+
+    pair: AssetPair
+    field: MaterialField
+    latents: StructuredLatents
+    alignment: Alignment
+    annotation: Annotation
+    judgement: Judgement
+    contributions: tuple[Contribution, ...] = ()
+    sources: tuple[SourceFile, ...] = ()
+    digests: Mapping[str, str] = with_default(default_factory=dict)
+    others: tuple[MaterialField, ...] = ()
+
+
+@dataclass(frozen=True)
+class Failed:
+    """An asset that cannot go in.
+
+    ``reason`` says why in a line; ``traceback`` says where, if slatprep itself is at fault.
+    """
+
+    pair: AssetPair
+    status: Literal[Status.FAILED, Status.SKIPPED]
+    reason: str
+    traceback: str = ""

@@ -9,8 +9,9 @@ import pytest
 from support.raw_sources import field_at
 
 from slatprep.errors import InputError
-from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.records import Engine
 from slatprep.store import open_store
 
 trimesh = pytest.importorskip("trimesh")
@@ -125,7 +126,8 @@ def test_a_store_of_parts_follows_every_mesh(tmp_path):
     np.savez(tmp_path / "slat" / "a.npz", coords=shell, feats=feats)
     source = PixieverseSource(tmp_path / "p", adapter="parts")
     store = tmp_path / "s.zarr"
-    of = BuildParameters(source, SlatSource(tmp_path / "slat")), store
+    known = AlignParameters(engine=Engine.KNOWN)
+    of = BuildParameters(source, SlatSource(tmp_path / "slat"), align=known), store
 
     def heavy() -> np.ndarray:
         """Say which voxels of the asset are of the handle's material."""
