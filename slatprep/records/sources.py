@@ -106,9 +106,8 @@ def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
     """Return values of any shape in SI units; those without a known unit stay as they are."""
     given = np.asarray(values, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        if unit.startswith(LOG10):
-            return np.asarray(10.0**given)
-        return np.asarray(given * FACTORS.get(unit, 1.0))
+        si = 10.0**given if unit.startswith(LOG10) else given * FACTORS.get(unit, 1.0)
+    return np.asarray(si)
 
 
 @dataclass(frozen=True)
