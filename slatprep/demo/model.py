@@ -74,12 +74,9 @@ class Model:
     symmetric: bool = False
 
 
-class Parts(list[Part]):
-    """The parts of an object under construction."""
-
-    def add(self, stuff: Stuff, *shapes: Shape) -> None:
-        """Add shapes of one stuff."""
-        self += [Part(shape, stuff) for shape in shapes]
+def made_of(stuff: Stuff, *shapes: Shape) -> list[Part]:
+    """Return parts of one stuff."""
+    return [Part(shape, stuff) for shape in shapes]
 
 
 def vec(*values: float) -> Array:
@@ -141,7 +138,7 @@ def vessel(
     return carve(cone(vec(0, 0, bottom), vec(0, 0, top), radius, top_radius), hollow)
 
 
-def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) -> Parts:
+def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) -> list[Part]:
     """Return a pot standing on z = 0, filled up to four fifths."""
     foot = radius * rng.uniform(0.65, 0.8)
     wall = 0.13 * radius
@@ -149,4 +146,4 @@ def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) 
     inner = foot + (radius - foot) * level / height - 0.5 * wall
     content = cone(vec(0, 0, wall), vec(0, 0, level), foot - 0.5 * wall, inner)
     shell = vessel(0.0, height, foot, radius, wall, floor=1.5 * wall)
-    return Parts([Part(shell, outside), Part(content, filling)])
+    return [Part(shell, outside), Part(content, filling)]

@@ -50,18 +50,14 @@ def test_a_transform_turns_and_scales_before_it_shifts():
 
 
 @given(poses)
-def test_an_inverse_undoes_a_transform(transform):
-    points = np.array([[0.1, 0.2, 0.3], [-0.5, 0.5, 0.0]])
-    there = apply_transform(transform, points)
-    np.testing.assert_allclose(
-        apply_transform(invert_transform(transform), there), points, atol=1e-9
-    )
+def test_inverses_and_parts_of_a_transform(transform):
     np.testing.assert_allclose(invert_transform(transform), np.linalg.inv(transform), atol=1e-9)
-
-
-@given(poses)
-def test_splitting_and_making_are_inverse(transform):
     np.testing.assert_allclose(make_transform(*split_transform(transform)), transform, atol=1e-9)
+    # The nearest similarity of points that one has moved is that.
+    points = np.random.default_rng(0).normal((3.0, -1.0, 2.0), size=(50, 3))
+    found = nearest_similarity(points, apply_transform(transform, points))
+    np.testing.assert_allclose(found, transform, atol=1e-9)
+    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
 
 
 @pytest.mark.parametrize(
@@ -79,19 +75,9 @@ def test_what_is_no_similarity_is_refused(matrix):
         split_transform(matrix)
 
 
-@given(poses)
-def test_the_nearest_similarity_of_points_that_one_has_moved_is_that(transform):
-    points = np.random.default_rng(0).normal((3.0, -1.0, 2.0), size=(50, 3))
-    found = nearest_similarity(points, apply_transform(transform, points))
-    np.testing.assert_allclose(found, transform, atol=1e-9)
-    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
-
-
 def test_of_mirrored_points_the_nearest_similarity_is_no_mirror():
     """Of a cloud of the widths 3, 2 and 1 it is the half turn that leaves the widest two right."""
-    points = np.array(
-        [one for width in (3, 2, 1) for one in np.eye(3)[3 - width] * [[width], [-width]]]
-    )
+    points = np.concatenate([np.diag([3.0, 2.0, 1.0]), -np.diag([3.0, 2.0, 1.0])])
     found = nearest_similarity(points, -points)
     scale = (3**2 + 2**2 - 1**2) / (3**2 + 2**2 + 1**2)
     np.testing.assert_allclose(found[:3, :3], scale * np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
@@ -105,16 +91,13 @@ def test_voxels_and_occupancy_are_two_forms_of_one_set(voxels):
 
 def test_displacement_by_hand():
     shifted = make_transform(np.eye(3), [3 / 64, 4 / 64, 0])
-    assert displacement(
-        shifted, np.eye(4), voxel_centres([[1, 2, 3], [60, 5, 9]])
-    ) == pytest.approx(5.0)
-    # Scaled by 2, the inverse looks half as far from the centre: 0.5 voxel at
-    # the voxel whose centre is one voxel off on one axis... and root 3 of it on all.
+    some = voxel_centres([[1, 2, 3], [60, 5, 9]])
+    assert displacement(shifted, np.eye(4), some) == pytest.approx(5.0)
+    # Scaled by 2, the inverse looks half as far from the cube's centre, here half a voxel on each
+    # axis.
     doubled = make_transform(np.eye(3), scale=2.0)
-    voxel = [[32, 32, 32]]  # centred half a voxel off on each axis
-    assert displacement(doubled, np.eye(4), voxel_centres(voxel)) == pytest.approx(
-        np.sqrt(3) * 0.25
-    )
+    apart = displacement(doubled, np.eye(4), voxel_centres([[32, 32, 32]]))
+    assert apart == pytest.approx(np.sqrt(3) * 0.25)
 
 
 @pytest.mark.parametrize("side", [2, 31, 64, 96, 128, 256])
@@ -142,11 +125,7 @@ def test_cells_of_voxels_of_any_grid_are_those_that_centres_say(side):
 
 
 @settings(max_examples=20)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    side=st.integers(1, 7),
-    share=st.sampled_from([0.1, 0.5, 0.8, 0.95, 1.0]),
-)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.sampled_from([0.1, 0.5, 0.8, 0.95, 1.0]))
 def test_boundary_box_and_filling_are_those_of_scipy(seed, side, share):
     solid = np.random.default_rng(seed).random((side, side, side)) < share
     faces = ndimage.generate_binary_structure(3, 1)
