@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry.distance import NOTHING, spread
+from slatprep.geometry.distance import NOTHING, padded, spread
 from slatprep.geometry.kernel import kernel
 from slatprep.records import RESOLUTION
 
@@ -172,8 +172,9 @@ def _columns(row):  # type: ignore[no-untyped-def]
     voxel with the same first index, at least the square of `NOTHING` for none.
     """
     below, above = np.full(row.shape, -1, np.int8), np.full(row.shape, -1, np.int8)
-    apart, slab = np.empty(row.shape, np.int16), np.empty(row.shape[1:], np.int16)
     size = row.shape[0]
+    apart, lines = np.empty(row.shape, np.int16), padded(size, size)
+    slab = lines.reshape(3, size, size)[1]
     for i in range(size):
         for j in range(size):
             slab[j, :] = NOTHING * NOTHING
@@ -190,7 +191,7 @@ def _columns(row):  # type: ignore[no-untyped-def]
                 if below[i, j, k] >= 0:
                     least = min(least, k - below[i, j, k])
                 slab[j, k] = least * least
-        spread(slab, apart[i])
+        spread(lines, apart[i].reshape(-1), size)
     return below, above, apart
 
 
