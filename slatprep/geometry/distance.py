@@ -57,13 +57,17 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
     apart = np.empty(length, np.int16)
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):
-            line = solid[i, j]
+            line, ahead = solid[i, j], solid[i, j, 1:]
+            into, out = inside[i, j, :length], outside[i, j, :length]
             changes = 0
-            for k in range(1, length):
-                changes += line[k] != line[k - 1]
+            for k in range(len(ahead)):
+                changes += line[k] != ahead[k]
             if changes == 0:  # as of most lines
-                inside[i, j, :length] = NOTHING * NOTHING if line[0] else 0
-                outside[i, j, :length] = 0 if line[0] else NOTHING * NOTHING
+                within, beyond = (NOTHING * NOTHING, 0) if line[0] else (0, NOTHING * NOTHING)
+                for k in range(len(into)):
+                    into[k] = within
+                for k in range(len(out)):
+                    out[k] = beyond
                 continue
             steps = NOTHING
             for k in range(length):
@@ -76,8 +80,7 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
                 apart[k] = min(apart[k], steps)
             for k in range(length):
                 square = apart[k] * apart[k]
-                inside[i, j, k] = square if line[k] else 0
-                outside[i, j, k] = 0 if line[k] else square
+                into[k], out[k] = (square, 0) if line[k] else (0, square)
 
 
 @kernel()
@@ -169,8 +172,10 @@ def near_surface(distance, band):  # type: ignore[no-untyped-def]
     lines = np.zeros(distance.shape[:2], np.int64)
     for i in range(distance.shape[0]):
         for j in range(distance.shape[1]):
-            for k in range(distance.shape[2]):
-                lines[i, j] += abs(distance[i, j, k]) <= limit
+            line, found = distance[i, j], 0
+            for k in range(len(line)):
+                found += abs(line[k]) <= limit
+            lines[i, j] = found
     points = np.empty((3, lines.sum()), np.uint8)
     values = np.empty(points.shape[1], np.float32)
     found = 0

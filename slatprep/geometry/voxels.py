@@ -16,13 +16,13 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
     """
     padded = np.pad(np.asarray(occupancy, dtype=bool), 1)
-    inner = padded[1:-1, 1:-1, 1:-1]
-    buried = padded[:-2, 1:-1, 1:-1] & padded[2:, 1:-1, 1:-1]
-    buried &= padded[1:-1, :-2, 1:-1]
-    buried &= padded[1:-1, 2:, 1:-1]
-    buried &= padded[1:-1, 1:-1, :-2]
-    buried &= padded[1:-1, 1:-1, 2:]
-    surface: NDArray[np.bool_] = inner & ~buried
+    # In a flattened grid a neighbour is so many places on, which numpy looks at far faster.
+    flat = padded.reshape(-1)
+    buried = flat.copy()
+    for step in np.array(padded.strides):
+        buried[step:] &= flat[:-step]
+        buried[:-step] &= flat[step:]
+    surface: NDArray[np.bool_] = (flat & ~buried).reshape(padded.shape)[1:-1, 1:-1, 1:-1]
     return surface
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slatprep import normalize
 from slatprep.errors import InputError
-from slatprep.geometry.voxels import voxels_of
+from slatprep.geometry.voxels import voxels_at
 from slatprep.parameters import PixieverseSource, SampleParameters
 from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, find_by_pattern
@@ -103,8 +103,9 @@ def read_grid(
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
     annotated = _annotated(occupancy, material, path, warnings)
 
-    voxels = voxels_of(annotated)
-    properties, classes = _gather(channels, annotated), material[annotated]
+    cells = np.flatnonzero(annotated)
+    voxels = voxels_at(cells)
+    properties, classes = _gather(channels, cells), material.reshape(-1)[cells].astype(np.uint8)
     if raw:
         held = properties, classes, PROPERTIES, MATERIAL_CLASSES
         warnings += require_plausible(path, *held, pair.roots)
@@ -120,7 +121,7 @@ def read_grid(
     keep = physical_rows(path, fine, PROPERTIES, told, max_unphysical, warnings)
     unphysical = int(np.count_nonzero(~keep))
     if unphysical:
-        voxels, properties = voxels[keep], properties[keep]
+        voxels, properties, classes = voxels[keep], properties[keep], classes[keep]
     if not raw:
         properties = _to_si(properties, warnings)
 
@@ -130,7 +131,7 @@ def read_grid(
     return MaterialField(
         occupancy=occupancy,
         voxels=voxels,
-        material=classes[keep].astype(np.uint8),
+        material=classes,
         properties=np.ascontiguousarray(properties),
         unphysical=unphysical,
         bounds=bounds,
@@ -153,7 +154,7 @@ def read_prediction(
     channels, raw, _ = _channels_of(path, root)
     classes = _classes_of(channels, where, path, [])
     material = np.where(classes == UNLABELLED, BACKGROUND, classes)[where].astype(np.uint8)
-    values = _gather(channels, where).astype(np.float64)
+    values = _gather(channels, np.flatnonzero(where)).astype(np.float64)
     bad = ~np.isfinite(values)
     if raw:
         bad[:, :2] |= values[:, :2] < 0
@@ -260,14 +261,14 @@ def _note(warnings: list[str], voxels: NDArray[np.bool_], what: str) -> None:
         warnings.append(f"{np.count_nonzero(voxels)} {what}")
 
 
-def _gather(channels: NDArray[Any], where: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the properties (K, 3) at the voxels of a mask, ordered as PROPERTY_COLUMNS.
+def _gather(channels: NDArray[Any], cells: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Return the properties (K, 3) at places of the flattened grid, ordered as PROPERTY_COLUMNS.
 
     Memory is column by column, as the checks read them.
     """
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
-        columns = [channels[k][where].astype(np.float32) for k in _CHANNEL_ORDER]
-    return np.stack(columns).T
+        planes = [channels[k].reshape(-1)[cells].astype(np.float32) for k in _CHANNEL_ORDER]
+    return np.stack(planes).T
 
 
 def _to_si(values: NDArray[np.float32], warnings: list[str]) -> NDArray[np.float32]:

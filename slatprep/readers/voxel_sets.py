@@ -114,8 +114,8 @@ def _cells_of(
 
 
 def physical(values: NDArray[np.float32], table: Sequence[records.Property]) -> NDArray[np.bool_]:
-    """Return which values (K, P) a material can have."""
-    return np.stack([one.physical(values[:, k]) for k, one in enumerate(table)], axis=1)
+    """Return which values (K, P) a material can have; a column after the other in memory."""
+    return np.stack([one.physical(values[:, k]) for k, one in enumerate(table)]).T
 
 
 def physical_rows(
