@@ -50,14 +50,12 @@ class LocalFile(FileIO):
         """Read up to `length` bytes from an offset."""
         return os.pread(self.fileno(), length, offset)
 
-    def prefetch(self, length: int, offset: int) -> None:
-        """Do nothing: the system reads ahead by itself."""
-
 
 class LocalFolder:
     """An open directory: files read below it belong to one store, even if that is replaced.
 
-    Errors call it `path`. `prefetch_bytes` is the longest range worth a `prefetch`; 0 for none.
+    Errors call it `path`. `prefetch_bytes` is the longest range to ask for at once; 0 for none,
+    where the system reads ahead by itself.
     """
 
     prefetch_bytes = 0

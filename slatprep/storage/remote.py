@@ -146,17 +146,13 @@ class RemoteFile(io.RawIOBase):
         if size is not None:
             self.__dict__["_size"] = size
         self._position, self._ended = 0, False
-        self._prefetched = (0, b"")
 
     def size(self) -> int:
         """Return its length in bytes."""
         return self._size
 
     def pread(self, length: int, offset: int) -> bytes:
-        """Read up to `length` bytes from an offset: prefetched, or with one request."""
-        begin, data = self._prefetched
-        if begin <= offset and offset + length <= begin + len(data):
-            return data[offset - begin : offset - begin + length]
+        """Read up to `length` bytes from an offset, with one request."""
         # Asked for each time: connections do not survive a fork; fsspec caches one per process.
         try:
             with connected(self.place, fresh=False) as (system, name):
@@ -174,10 +170,6 @@ class RemoteFile(io.RawIOBase):
             if offset < self._size:
                 raise
             return b""  # Servers refuse a range that begins after the end.
-
-    def prefetch(self, length: int, offset: int) -> None:
-        """Read a range with one request, and keep it until the next."""
-        self._prefetched = (offset, self.pread(length, offset))
 
     def readall(self) -> bytes:
         """Read to the end, in blocks of `io.BufferedReader`: Python's own have 8 kB."""

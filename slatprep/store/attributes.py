@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -14,7 +15,7 @@ from slatprep import records
 from slatprep.parameters import Length, SampleParameters
 from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT, FORMAT_VERSION
-from slatprep.store.record_json import adapter_of
+from slatprep.store.record_json import adapter_of, faults_in
 
 
 @dataclass(frozen=True)
@@ -117,14 +118,10 @@ def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Fin
         read = adapter_of(RootAttributes).validate_json(orjson.dumps(attributes), strict=True)
         return cast(RootAttributes, read)
     except ValidationError as error:
+        start = re.compile("Input should be |Value error, ")
         return tuple(
-            Finding(
-                "zarr.json",
-                "",
-                f"attribute {'/'.join(map(str, fault['loc']))} is {_shown(fault)}",
-                fault["msg"].removeprefix("Input should be ").removeprefix("Value error, "),
-            )
-            for fault in error.errors(include_url=False)[:_FAULTS]
+            Finding("zarr.json", "", f"attribute {at} is {value or 'missing'}", start.sub("", what))
+            for at, what, value in faults_in(error)
         )
 
 
@@ -174,10 +171,3 @@ def store_attributes(
         },
         "build": dict(build),
     }
-
-
-_FAULTS = 64
-
-
-def _shown(fault: Mapping[str, Any]) -> str:
-    return "missing" if fault["type"] == "missing" else repr(fault["input"])[:100]

@@ -74,31 +74,26 @@ def read_metadata(path: Place) -> dict[str, Any]:
         raise StoreError(f"{path}: cannot be read as metadata ({error})") from None
 
 
-def array_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield what is wrong with the ``zarr.json`` of an array of the contract, by its name.
-
-    `sizes` are what `dimension_sizes` gave. Of other arrays nothing is asked.
-    """
-    layout = LAYOUTS.get(name)
-    if layout is None:
-        return
-    yield from size_findings(name, metadata, sizes)
-    if isinstance(metadata, dict):
-        empty = layout.fill_value
-        wanted = {
-            "data_type": _ZARR_NAMES.get(layout.dtype, layout.dtype),
-            "dimension_names": list(layout.dimensions),
-            "zarr_format": 3,
-            "fill_value": empty if empty == empty else "NaN",  # which differs from itself
-        }
-        yield from _differences(f"{name}/zarr.json", metadata, wanted)
+def array_findings(
+    layout: ArrayLayout, metadata: Mapping[str, Any], sizes: Mapping[str, int]
+) -> Iterator[Finding]:
+    """Yield what is wrong with the ``zarr.json`` of an array; `sizes` are `dimension_sizes`."""
+    yield from size_findings(layout.name, metadata, sizes)
+    empty = layout.fill_value
+    wanted = {
+        "data_type": _ZARR_NAMES.get(layout.dtype, layout.dtype),
+        "dimension_names": list(layout.dimensions),
+        "zarr_format": 3,
+        "fill_value": empty if empty == empty else "NaN",  # which differs from itself
+    }
+    yield from _misformed(f"{layout.name}/zarr.json", metadata, wanted)
 
 
 def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
     """Yield what is wrong with the sizes that the metadata of one array claim.
 
-    Parameters are those of `array_findings`. An array without findings may be
-    read: no more memory is set aside than its files account for.
+    `sizes` are `dimension_sizes`; of arrays that are not in the contract nothing is asked. An array
+    without findings may be read: no more memory is set aside than its files account for.
     """
     layout = LAYOUTS.get(name)
     if layout is None:
@@ -108,7 +103,7 @@ def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iter
         yield Finding(where, "", "describes no array", "the metadata of an array")
         return
     shape = tuple(sizes[dimension] for dimension in layout.dimensions)
-    yield from _differences(where, metadata, {"shape": list(shape)})
+    yield from _misformed(where, metadata, {"shape": list(shape)})
     yield from _chunk_findings(where, layout, metadata, shape)
 
 
@@ -136,14 +131,6 @@ def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
     return sizes
 
 
-def _differences(
-    where: str, metadata: Mapping[str, Any], wanted: Mapping[str, object]
-) -> Iterator[Finding]:
-    for key, expected in wanted.items():
-        if metadata.get(key) != expected:
-            yield Finding(where, "", f"{key} is {metadata.get(key)!r}", repr(expected))
-
-
 def _chunk_findings(
     where: str, layout: ArrayLayout, metadata: Mapping[str, Any], shape: tuple[int, ...]
 ) -> Iterator[Finding]:
@@ -160,15 +147,10 @@ def _chunk_findings(
         ("chunk", inner, _MAX_CHUNK_ROWS[group]),
         ("shard", outer, _MAX_SHARD_ROWS[group] if sharded else _MAX_CHUNK_ROWS[group]),
     ):
-        whole = isinstance(sizes, list) and all(type(n) is int for n in sizes)
-        rows = list(shape[1:])
-        fits = (
-            whole
-            and len(sizes) == len(shape)
-            and all(n <= m for n, m in zip(sizes[1:], rows, strict=True))
-        )
-        if not fits or min(sizes) < 1 or sizes[0] > limit:
-            expected = f"1 to {limit} rows of at most {rows}"
+        fits = isinstance(sizes, list) and len(sizes) == len(shape)
+        pairs = zip(sizes, (limit, *shape[1:]), strict=True) if fits else ()
+        if not fits or not all(type(n) is int and 1 <= n <= most for n, most in pairs):
+            expected = f"1 to {limit} rows of at most {list(shape[1:])}"
             yield Finding(where, "", f"{kind} shape is {sizes!r}", expected)
 
 
@@ -189,11 +171,11 @@ _KEYS = frozenset(
      "fill_value", "codecs", "attributes", "dimension_names", "storage_transformers")
 )  # fmt: skip
 _FORMS: dict[str, Any] = {
-    "chunk_grid": {"name": ("regular",), "configuration": {"chunk_shape": list}},
-    "chunk_key_encoding": {"name": ("default",), "configuration": {"separator": ("/",)}},
+    "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list}},
+    "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
 }
 _SETTINGS: dict[str, Any] = {
-    "bytes": {"endian": ("little",)},
+    "bytes": {"endian": "little"},
     "zstd": {"level": range(23), "checksum": bool},
     "blosc": {
         "typesize": range(1, 256),
@@ -206,46 +188,37 @@ _SETTINGS: dict[str, Any] = {
         "chunk_shape": list,
         "codecs": list,
         "index_codecs": list,
-        "index_location": ("end",),
+        "index_location": "end",
     },
 }
 """Configurations of codecs, see `_has_form`; those of others are empty."""
 
 
+_GATE: dict[str, Any] = {"zarr_format": 3, "attributes": (dict, None)}
+_ARRAY_GATE: dict[str, Any] = {
+    "storage_transformers": (None, []),
+    "data_type": DATA_TYPES,
+    "dimension_names": (list[str], None),
+}
+
+
 def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
     """Yield what is not allowed in the ``zarr.json`` of an array or group, or the root's copy."""
-    where = f"{name}/zarr.json"
-    kinds = {"array": NAMES, "group": GROUPS}
-    if not isinstance(metadata, Mapping) or name not in kinds.get(
-        str(metadata.get("node_type")), ()
-    ):
-        yield Finding(
-            where, "", "is no array or group of a store", "those that docs/formats.md has"
-        )
+    where, kinds = f"{name}/zarr.json", {"array": NAMES, "group": GROUPS}
+    kind = str(metadata.get("node_type")) if isinstance(metadata, Mapping) else ""
+    if not isinstance(metadata, Mapping) or name not in kinds.get(kind, ()):
+        what = "is no array or group of a store"
+        yield Finding(where, "", what, "those that docs/formats.md has")
         return
-    found = metadata.get("zarr_format")
-    if type(found) is not int or found != 3:
-        yield Finding(where, "", f"zarr_format is {found!r}", "3")
-    attributes = metadata.get("attributes", {})
-    if not isinstance(attributes, Mapping):
-        yield Finding(where, "", f"attributes is {attributes!r}", "a JSON object")
-    if metadata["node_type"] == "group":
+    yield from _misformed(where, metadata, _GATE)
+    if kind == "group":
         # zarr-python would take arrays from here that nobody has looked at.
         nested = metadata.get("consolidated_metadata")
-        if nested is not None and not (
-            isinstance(nested, Mapping) and nested.get("metadata") == {}
-        ):
+        empty = isinstance(nested, Mapping) and nested.get("metadata") == {}
+        if not (nested is None or empty):
             yield Finding(where, "", "has consolidated metadata of its own", "the root's alone")
         return
-    transformers = metadata.get("storage_transformers")
-    if transformers not in (None, []):
-        yield Finding(where, "", f"storage_transformers is {transformers!r}", "none")
-    data_type = metadata.get("data_type")
-    if data_type not in DATA_TYPES:
-        yield Finding(where, "", f"data_type is {data_type!r}", f"one of {', '.join(DATA_TYPES)}")
-    axes = metadata.get("dimension_names") or []
-    if not isinstance(axes, list) or not all(isinstance(axis, str) for axis in axes):
-        yield Finding(where, "", f"dimension_names is {axes!r}", "a name for each dimension")
+    yield from _misformed(where, metadata, _ARRAY_GATE)
     for codec in _codecs(metadata.get("codecs")):
         used = codec.get("name")
         if used not in CODECS:
@@ -259,9 +232,7 @@ def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
     where = f"{name}/zarr.json"
     for key in metadata.keys() - _KEYS:
         yield Finding(where, "", f"has {key!r}", f"none but {', '.join(sorted(_KEYS))}")
-    for key, form in _FORMS.items():
-        if not _has_form(metadata.get(key), form):
-            yield Finding(where, "", f"{key} is {metadata.get(key)!r}", _in_words(form))
+    yield from _misformed(where, metadata, _FORMS)
     for codec in _codecs(metadata.get("codecs")):
         name, settings = str(codec.get("name")), codec.get("configuration", {})
         wanted = _SETTINGS.get(name, {})
@@ -270,14 +241,25 @@ def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
             yield Finding(where, "", what, _in_words(wanted))
 
 
+def _misformed(
+    where: str, metadata: Mapping[str, Any], forms: Mapping[str, Any]
+) -> Iterator[Finding]:
+    """Yield the entries that have another form, see `_has_form`."""
+    for key, form in forms.items():
+        if not _has_form(metadata.get(key), form):
+            yield Finding(where, "", f"{key} is {metadata.get(key)!r}", _in_words(form))
+
+
 def _has_form(value: Any, form: Any) -> bool:
-    """Whether a value of JSON has a form: a type, one of several values, or an object of forms."""
+    """Whether a value of JSON has a form: a type, an object of forms, one of some, or a value."""
     if isinstance(form, dict):
         whole = isinstance(value, dict) and value.keys() == form.keys()
         return whole and all(_has_form(value[key], form[key]) for key in form)
-    if isinstance(form, type):
-        return type(value) is form
-    return any(type(value) is type(one) and value == one for one in form)
+    if isinstance(form, tuple | range):
+        return any(_has_form(value, one) for one in form)
+    if form == list[str]:
+        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+    return type(value) is form or (type(value) is type(form) and value == form)
 
 
 def _in_words(form: Any) -> str:
@@ -285,7 +267,9 @@ def _in_words(form: Any) -> str:
         return f"{{{', '.join(f'{key}: {_in_words(one)}' for key, one in form.items())}}}"
     if isinstance(form, range):
         return f"{form[0]} to {form[-1]}"
-    return form.__name__ if isinstance(form, type) else " or ".join(map(repr, form))
+    if isinstance(form, tuple):
+        return " or ".join(map(_in_words, form))
+    return form.__name__ if isinstance(form, type) else repr(form)
 
 
 def _codecs(codecs: Any) -> Iterator[Mapping[str, Any]]:

@@ -162,7 +162,7 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
         yield Finding("zarr.json", "", f"has {merged[0]} alone", f"{both}, or neither")
     for layout in (*ARRAYS, *MERGED):
         if layout.name in arrays:
-            yield from array_findings(layout.name, arrays[layout.name], sizes)
+            yield from array_findings(layout, arrays[layout.name], sizes)
 
 
 def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[Finding]]:

@@ -6,7 +6,6 @@ import errno
 import pkgutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,10 +18,11 @@ from slatprep.errors import ConfigError, StoreError, amount
 from slatprep.geometry.voxels import shown_in_cells, voxels_at
 from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents
+from slatprep.storage.documents import read_document
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
 from slatprep.store.attributes import width_findings
-from slatprep.store.contract import MAX_VOXELS, read_metadata
+from slatprep.store.contract import MAX_METADATA_BYTES, MAX_VOXELS
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with
 from slatprep.store.shard_reader import DamagedFileError
 
@@ -322,8 +322,6 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
     if copy:
         path = storage_of(path).copied_version()
     document = _root_document(path)
-    if not document:
-        _require_readable(path)
     attributes = document.get("attributes", {})
     if attributes.get("format") != FORMAT:
         raise StoreError(
@@ -345,8 +343,11 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
 
 def is_store(path: Place) -> bool:
     """Whether a slatprep store of any format version lies at a place itself."""
-    document = _root_document(path)
-    return bool(document.get("attributes", {}).get("format") == FORMAT)
+    try:
+        attributes = _root_document(path).get("attributes", {})
+    except StoreError:
+        return False
+    return bool(attributes.get("format") == FORMAT)
 
 
 def require_outside(out: Path) -> None:
@@ -366,32 +367,28 @@ def require_outside(out: Path) -> None:
         raise ConfigError(f"{out} {where}; expected a path outside of any store")
 
 
-def _require_readable(path: Place) -> None:
-    """Raise StoreError if there is nothing at all, or it may not be read."""
-    needed = path / "zarr.json"
+def _root_document(path: Place) -> dict[str, Any]:
+    """Return the root's ``zarr.json``, empty where it is not a store's.
+
+    StoreError if there is nothing at all, or it cannot be read.
+    """
+    file = path / "zarr.json"
     try:
-        if needed.exists():
-            with suppress(FileNotFoundError):
-                storage_of(needed).read(0)
-            return
+        document = read_document(file, MAX_METADATA_BYTES)
+    except (FileNotFoundError, NotADirectoryError):
+        raise StoreError(
+            f"{path} is not a slatprep store: {file} does not exist; build a store with "
+            "`slatprep build-store`"
+        ) from None
     except PermissionError as error:
         raise StoreError(
-            f"{needed}: may not be read ({error.strerror}); expected a store that these "
+            f"{file}: may not be read ({error.strerror}); expected a store that these "
             "credentials may read"
         ) from None
     except OSError as error:
-        if error.errno in (errno.EINVAL, errno.EISDIR):
-            return  # A pipe or a folder of that name is no store.
-        raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
-    raise StoreError(
-        f"{path} is not a slatprep store: {needed} does not exist; build a store with "
-        "`slatprep build-store`"
-    )
-
-
-def _root_document(path: Place) -> dict[str, Any]:
-    try:
-        document = read_metadata(path / "zarr.json")
-    except StoreError:
+        if error.errno not in (errno.EINVAL, errno.EISDIR):
+            raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
+        return {}  # A pipe or a folder of that name is no store.
+    except ValueError:
         return {}
     return document if isinstance(document.get("attributes"), dict) else {}

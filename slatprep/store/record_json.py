@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 import orjson
 
 from slatprep.errors import StoreError
-from slatprep.records import SourceFile, Status
+from slatprep.records import SourceFile
 from slatprep.storage.place import is_place
 from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES
 from slatprep.store.record import AssetRecord, BuildRecord, Record
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 
 _FAULTS = 64
+_Kind = TypeVar("_Kind")
 
 
 class RecordError(StoreError):
@@ -57,19 +58,12 @@ def _without(entry: AssetRecord | SourceFile, name: str) -> dict[str, object]:
     return {one.name: getattr(entry, one.name) for one in fields(entry) if one.name != name}
 
 
-def read_record(text: bytes | str, where: str) -> Record:
-    """Read a line of ``assets.jsonl``, which errors call `where`.
+def read_asset_record(text: bytes | str, where: str) -> AssetRecord:
+    """Read the record of a row, which errors call `where`.
 
     RecordError if it is no record of this version, or breaks its schema.
     """
-    record: Record = _read(Record, text, where)
-    return record
-
-
-def read_asset_record(text: bytes | str, where: str) -> AssetRecord:
-    """Read the record of a row; see `read_record`."""
-    record: AssetRecord = _read(AssetRecord, text, where)
-    return record
+    return _read(AssetRecord, text, where)
 
 
 def faults_of(record: AssetRecord) -> tuple[str, ...]:
@@ -88,9 +82,8 @@ def faults_of(record: AssetRecord) -> tuple[str, ...]:
 
 
 def read_build_record(text: bytes | str, where: str) -> BuildRecord:
-    """Read ``build.json``; see `read_record`."""
-    record: BuildRecord = _read(BuildRecord, text, where)
-    return record
+    """Read ``build.json``; see `read_asset_record`."""
+    return _read(BuildRecord, text, where)
 
 
 def build_id_of(head: object, digests: Iterable[tuple[str, bytes]]) -> str:
@@ -111,37 +104,35 @@ def digest_of(text: bytes) -> bytes:
 def adapter_of(kind: Any) -> TypeAdapter[Any]:
     """Return what reads a kind of record, and knows its JSON Schema."""
     # Late: pydantic takes a third of a second that a command without records does not have.
-    from pydantic import Field, TypeAdapter
+    from pydantic import TypeAdapter
 
-    if kind is Record:
-        return TypeAdapter(Annotated[Record, Field(discriminator="status")])
     return TypeAdapter(kind)
 
 
-def _read(kind: Any, text: bytes | str, where: str) -> Any:
+def _read(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
     from pydantic import ValidationError
 
     try:
-        read = adapter_of(kind).validate_json(text, strict=True)
+        read: _Kind = adapter_of(kind).validate_json(text, strict=True)  # type: ignore[arg-type]
     except ValidationError as error:
-        raise RecordError(where, _faults(error)) from None
+        found = [
+            f"{place or 'it'}: {message}{value and f', found {value}'}"
+            for place, message, value in faults_in(error)
+        ]
+        raise RecordError(where, tuple(found)) from None
     return read
 
 
-def _faults(error: ValidationError) -> tuple[str, ...]:
-    faults = []
-    # A stranger's record may have any number.
+def faults_in(error: ValidationError) -> Iterator[tuple[str, str, str]]:
+    """Yield where each fault is, what should be there, and what is; empty where it is missing."""
+    # A stranger's document may have any number.
     found = error.errors(include_url=False)[:_FAULTS]
-    found_at = [fault["loc"] for fault in found]
     for fault in found:
         at = fault["loc"]
-        if any(other[: len(at)] == at and other != at for other in found_at):
+        if any(other["loc"][: len(at)] == at != other["loc"] for other in found):
             continue  # A list that is too short without the faulty item is no fault of its own.
-        # Of a record that may be one of two kinds the first step names the kind.
-        steps = [str(step) for step in at if step not in tuple(Status)]
-        shown = "" if fault["type"] == "missing" else f", found {str(fault['input'])[:60]!r}"
-        faults.append(f"{'/'.join(steps) or 'it'}: {fault['msg']}{shown}")
-    return tuple(faults)
+        value = "" if fault["type"] == "missing" else repr(fault["input"])[:100]
+        yield "/".join(map(str, at)), fault["msg"], value
 
 
 def _plain(value: object) -> Any:
@@ -180,15 +171,16 @@ FOLDER = Path(__file__).with_name("schema")
 
 def json_schemas() -> dict[str, dict[str, Any]]:
     """Return the JSON Schema (draft 2020-12) of each kind of record, by its file's name."""
+    from pydantic import Field
+
     dialect = "https://json-schema.org/draft/2020-12/schema"
-    adapters = {
-        "asset_record.schema.json": ("slatprep asset record", adapter_of(Record)),
-        "build_record.schema.json": ("slatprep build record", adapter_of(BuildRecord)),
-    }
+    kinds = {"asset": Annotated[Record, Field(discriminator="status")], "build": BuildRecord}
     schemas: dict[str, dict[str, Any]] = {}
-    for name, (title, adapter) in adapters.items():
-        schema = {"$schema": dialect, **adapter.json_schema(), "title": title}
-        schemas[name] = json.loads(json.dumps(schema))  # Defaults may be tuples.
+    for name, kind in kinds.items():
+        title = f"slatprep {name} record"
+        schema = {"$schema": dialect, **adapter_of(kind).json_schema(), "title": title}
+        # Defaults may be tuples.
+        schemas[f"{name}_record.schema.json"] = json.loads(json.dumps(schema))
     return schemas
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import accumulate, groupby, pairwise
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -32,9 +32,6 @@ OPEN_SHARDS = 32
 """Shards of one array that stay open at a time."""
 
 _COPIED_BYTES = 4 * 2**20
-
-_INDEX_CODECS = ["bytes", "crc32c"]
-
 
 MAX_CHUNK_BYTES = 256 * 2**20
 """What one chunk may unpack to; a grid's takes 3 MiB."""
@@ -122,32 +119,28 @@ class RowReader:
         StoreError if that makes no sense, or the array is not cut and packed as slatprep does it.
         """
         try:
-            return cls._of(folder, name, metadata)
+            text = metadata["data_type"] == "string"
+            dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
+            shape = whole_sizes(metadata["shape"])
+            outer = whole_sizes(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+            codecs, inner = metadata["codecs"], outer
+            sharded = codecs[0]["name"] == "sharding_indexed"
+            if sharded:
+                sharding = codecs[0]["configuration"]
+                inner, codecs = whole_sizes(sharding["chunk_shape"]), sharding["codecs"]
+                index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
+                at_end = sharding.get("index_location", "end") == "end"
+                if index_codecs != ["bytes", "crc32c"] or not at_end or metadata["codecs"][1:]:
+                    raise ValueError("shards with another index")
+            whole_rows = outer[1:] == inner[1:] == shape[1:] and inner[0] > 0 == outer[0] % inner[0]
+            if not whole_rows or metadata["chunk_key_encoding"] not in _KEYS:
+                raise ValueError("chunks that are no whole rows, or files with other names")
+            fill_value = np.array(metadata["fill_value"], object).astype(dtype)
+            decoder = ChunkDecoder.of(dtype, inner, codecs, MAX_TEXT.get(name, MAX_NAME_BYTES))
+            if decoder.nbytes > MAX_CHUNK_BYTES or outer[0] // inner[0] > MAX_SHARD_CHUNKS:
+                raise ValueError(f"chunks of {inner} in shards of {outer}")
         except BAD_METADATA as error:
             raise StoreError(f"{folder.path}/{name}: bad metadata ({error!r})") from None
-
-    @classmethod
-    def _of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
-        text = metadata["data_type"] == "string"
-        dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
-        shape = whole_sizes(metadata["shape"])
-        outer = whole_sizes(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-        codecs, inner = metadata["codecs"], outer
-        sharded = codecs[0]["name"] == "sharding_indexed"
-        if sharded:
-            sharding = codecs[0]["configuration"]
-            inner, codecs = whole_sizes(sharding["chunk_shape"]), sharding["codecs"]
-            index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
-            at_end = sharding.get("index_location", "end") == "end"
-            if index_codecs != _INDEX_CODECS or not at_end or len(metadata["codecs"]) > 1:
-                raise ValueError("shards with another index")
-        whole_rows = outer[1:] == inner[1:] == shape[1:] and inner[0] > 0 == outer[0] % inner[0]
-        if not whole_rows or metadata["chunk_key_encoding"] not in _KEYS:
-            raise ValueError("chunks that are no whole rows, or files with other names")
-        fill_value = np.array(metadata["fill_value"], object).astype(dtype)
-        decoder = ChunkDecoder.of(dtype, inner, codecs, MAX_TEXT.get(name, MAX_NAME_BYTES))
-        if decoder.nbytes > MAX_CHUNK_BYTES or outer[0] // inner[0] > MAX_SHARD_CHUNKS:
-            raise ValueError(f"chunks of {inner} in shards of {outer}")
         return cls(folder, name, shape, outer[0], sharded, decoder, fill_value)
 
     def key(self, shard: int) -> str:
@@ -162,18 +155,18 @@ class RowReader:
         if not 0 <= start <= stop <= self.shape[0]:
             raise StoreError(f"{self.name} has {self.shape[0]} rows, not {start} to {stop}")
         out = np.empty((stop - start, *self.shape[1:]), self.dtype)
-        rows, per_shard = self.chunk_rows, self.chunks_per_shard
-        if self.folder.prefetch_bytes:
-            self._prefetch(range(start // rows, -(-stop // rows)))
-        for chunk in range(start // rows, -(-stop // rows)):
+        rows = self.chunk_rows
+        chunks = range(start // rows, -(-stop // rows))
+        ahead = self._ahead(chunks) if self.folder.prefetch_bytes else {}
+        for chunk in chunks:
             base = chunk * rows
             first, last = max(start, base), min(stop, base + rows)
             target = out[first - start : last - start]
             if last - first == rows:
-                self._chunk(*divmod(chunk, per_shard), target)
+                self._chunk(chunk, target, ahead)
             else:
                 whole = self._scratch()
-                self._chunk(*divmod(chunk, per_shard), whole)
+                self._chunk(chunk, whole, ahead)
                 target[...] = whole[first - base : last - base]
         return out
 
@@ -183,60 +176,62 @@ class RowReader:
         They come several at a time; the checksum of each holds. StoreError if one is damaged, or
         they do not lie as slatprep writes them.
         """
-        for _, own in groupby(range(first, last), lambda chunk: chunk // self.chunks_per_shard):
-            chunks = list(own)
-            yield from self._packed(*divmod(chunks[0], self.chunks_per_shard), len(chunks))
+        for number, index in self._entries(range(first, last)):
+            shard, ends = self._shard(number), index.sum(axis=1)
+            if shard.file is None or (ends[:-1] != index[1:, 0]).any():
+                raise self._damaged(number, "its chunks do not follow one another")
+            # A few at a time: a shard may be larger than memory.
+            cuts = np.flatnonzero(np.diff(index[:, 0] // _COPIED_BYTES)) + 1
+            for own in np.split(index, cuts):
+                begin, end = own[0, 0], own[-1].sum()
+                data = self._range(number, shard.file, int(end - begin), int(begin))
+                parts = [data[at - begin : at - begin + length] for at, length in own]
+                if not all(map(crc32c_holds, parts)):
+                    raise self._damaged(number, "a chunk is damaged")
+                yield data, own[:, 1].tolist()
 
-    def _packed(self, number: int, place: int, chunks: int) -> Iterator[tuple[bytes, list[int]]]:
-        """Yield chunks of one shard, from `place` on, as they are packed."""
-        shard = self._shards.get(number) or self._open(number)
-        index = shard.index[place : place + chunks].astype(np.int64)
-        ends = index.sum(axis=1)
-        if shard.file is None or len(index) < chunks or (ends[:-1] != index[1:, 0]).any():
-            raise self._damaged(number, "its chunks do not follow one another")
-        # A few at a time: a shard may be larger than memory.
-        cuts = np.flatnonzero(np.diff(index[:, 0] // _COPIED_BYTES)) + 1
-        for own in np.split(index, cuts):
-            offset, lengths = int(own[0, 0]), own[:, 1].tolist()
-            try:
-                data = shard.file.pread(sum(lengths), offset)
-            except OSError as error:
-                raise self._damaged(number, f"cannot be read ({error.strerror})") from None
-            begins = [0, *accumulate(lengths)]
-            if not all(crc32c_holds(data[a:b]) for a, b in pairwise(begins)):
-                raise self._damaged(number, "a chunk is damaged")
-            yield data, lengths
+    def _entries(self, chunks: range) -> Iterator[tuple[int, NDArray[np.int64]]]:
+        """Yield each shard's number with offset and length of those of its chunks (K, 2)."""
+        for number, own in groupby(chunks, lambda chunk: chunk // self.chunks_per_shard):
+            places = [chunk % self.chunks_per_shard for chunk in own]
+            yield number, self._shard(number).index[places].astype(np.int64)
 
-    def _chunk(self, number: int, place: int, out: NDArray[Any]) -> None:
-        shard = self._shards.get(number) or self._open(number)
+    def _ahead(self, chunks: range) -> dict[tuple[int, int], bytes]:
+        """Ask once for the chunks of each shard, which lie side by side, and not once for each.
+
+        They are returned by shard and offset.
+        """
+        held = {}
+        for number, index in self._entries(chunks):
+            there, file = index[index[:, 0] >= 0].tolist(), self._shard(number).file
+            if len(there) > 1 and file is not None:
+                begin, end = min(there)[0], max(map(sum, there))
+                if end - begin <= self.folder.prefetch_bytes:
+                    data = self._range(number, file, end - begin, begin)
+                    for at, length in there:
+                        held[number, at] = data[at - begin : at - begin + length]
+        return held
+
+    def _chunk(self, chunk: int, out: NDArray[Any], ahead: dict[tuple[int, int], bytes]) -> None:
+        number, place = divmod(chunk, self.chunks_per_shard)
+        shard = self._shard(number)
         offset, length = shard.index[place].tolist()
         if shard.file is None or offset == length == MISSING:
             out[...] = self.fill_value
             return
+        data = ahead.get((number, offset)) or self._range(number, shard.file, length, offset)
         try:
-            data = shard.file.pread(length, offset)
             if len(data) != length:
                 raise StoreError("the file ends before it does")
             self.decoder.decode(data, out)
         except StoreError as error:
             raise self._damaged(number, f"chunk {place} is damaged: {error}") from None
+
+    def _range(self, number: int, file: RangeFile, length: int, offset: int) -> bytes:
+        try:
+            return file.pread(length, offset)
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
-
-    def _prefetch(self, chunks: range) -> None:
-        """Ask once for the chunks of each shard, which lie side by side, and not once for each."""
-        for number, own in groupby(chunks, lambda chunk: chunk // self.chunks_per_shard):
-            shard = self._shards.get(number) or self._open(number)
-            index = shard.index[[chunk % self.chunks_per_shard for chunk in own]]
-            offset, length = index[index[:, 0] != MISSING].astype(np.int64).T
-            if len(offset) > 1 and shard.file is not None:
-                begin, end = int(offset.min()), int((offset + length).max())
-                if end - begin <= self.folder.prefetch_bytes:
-                    try:
-                        shard.file.prefetch(end - begin, begin)
-                    except OSError as error:
-                        fault = f"cannot be read ({error.strerror})"
-                        raise self._damaged(number, fault) from None
 
     def _scratch(self) -> NDArray[Any]:
         """Return memory for a chunk of which only some rows are wanted, one for each thread."""
@@ -245,7 +240,9 @@ class RowReader:
             scratch = self._local.scratch = np.empty(self.decoder.shape, self.dtype)
         return scratch
 
-    def _open(self, number: int) -> _Shard:
+    def _shard(self, number: int) -> _Shard:
+        if (known := self._shards.get(number)) is not None:
+            return known
         try:
             file = self.folder.open(self.key(number))
             shard = _Shard(file, self._index(number, file, file.size()))

@@ -240,14 +240,16 @@ def test_a_file_that_is_cut_short_while_it_is_read_is_refused(tmp_path, shard):
 
 
 class Watched(LocalFile):
-    """A file that tells which ranges it was asked to fetch beforehand."""
+    """A file that tells which ranges it was asked for, but for its end, the index."""
 
     def __init__(self, name: str, asked: list[tuple[str, int, int]]) -> None:
         super().__init__(name)
         self.of, self.asked = name, asked
 
-    def prefetch(self, length: int, offset: int) -> None:
-        self.asked.append((self.of, offset, offset + length))
+    def pread(self, length: int, offset: int) -> bytes:
+        if offset + length < self.size():
+            self.asked.append((self.of, offset, offset + length))
+        return super().pread(length, offset)
 
 
 class WatchedFolder(LocalFolder):
@@ -279,20 +281,19 @@ def test_chunks_that_lie_side_by_side_are_asked_for_at_once(tmp_path):
     def asked(start: int, stop: int) -> list[tuple[str, int, int]]:
         folder.asked.clear()
         assert np.array_equal(reader.read(start, stop), values[start:stop])
-        return folder.asked
+        return list(folder.asked)
 
-    assert asked(5, 19) == [(files[0], indices[0][1][0], sum(indices[0][4]))]
-    assert asked(1, 50) == [
-        (files[0], indices[0][0][0], sum(indices[0][5])),
-        (files[1], indices[1][0][0], sum(indices[1][4])),
-    ]
-    assert asked(4, 8) == asked(9, 16) == []  # One chunk is asked for when it is needed.
+    def span(file: int, first: int, last: int) -> tuple[str, int, int]:
+        return files[file], indices[file][first][0], sum(indices[file][last])
 
-    length = sum(indices[1][2]) - indices[1][1][0]
-    folder.prefetch_bytes = length
-    assert asked(28, 36) == [(files[1], indices[1][1][0], sum(indices[1][2]))]
-    folder.prefetch_bytes = length - 1  # more than is worth it
-    assert asked(28, 36) == []
+    assert asked(5, 19) == [span(0, 1, 4)]
+    assert asked(1, 50) == [span(0, 0, 5), span(1, 0, 4), span(2, 0, 0)]
+    assert (asked(4, 8), asked(9, 16)) == ([span(0, 1, 1)], [span(0, 2, 2)])
+
+    folder.prefetch_bytes = sum(indices[1][2]) - indices[1][1][0]
+    assert asked(28, 36) == [span(1, 1, 2)]
+    folder.prefetch_bytes -= 1  # more than is worth it
+    assert asked(28, 36) == [span(1, 1, 1), span(1, 2, 2)]
 
 
 def test_the_shards_read_last_stay_open_and_no_others(tmp_path):
@@ -321,8 +322,6 @@ def test_what_cannot_be_read_names_its_file(shard, tmp_path, prefetch_bytes, ind
             if offset < self.size() - index_bytes:
                 raise OSError(errno.EIO, "the disk gave up")
             return super().pread(length, offset)
-
-        prefetch = pread  # type: ignore[assignment]
 
     class Folder(LocalFolder):
         def open(self, name: str) -> LocalFile:
