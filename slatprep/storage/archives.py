@@ -125,22 +125,17 @@ class Archive:
 
     def read(self, entry: Entry) -> bytes:
         """Read a member; InputError if the archive is not the one that was looked at."""
-        if not self.keeps:
-            return self.fetch(entry)
-        data = self._kept(entry)
+        data = self._kept(entry) if self.keeps else None
         if data is None and self.packed:
             _extend(self, Index())
             data = self._kept(entry)
+            if data is None:
+                raise self.replaced()
         if data is None:
-            data = self.fetch(entry)
-            self.keep(entry, data)
+            data = self.checked(entry, self.range(entry.size + BLOCK, entry.offset - BLOCK))
+            if self.keeps:
+                self.keep(entry, data)
         return data
-
-    def fetch(self, entry: Entry) -> bytes:
-        """Read a member from the archive itself, which is not compressed."""
-        if self.packed:
-            raise self.replaced()
-        return self.checked(entry, self.range(entry.size + BLOCK, entry.offset - BLOCK))
 
     def checked(self, entry: Entry, data: bytes) -> bytes:
         """Return the data of a member, given with the header in front of it."""

@@ -13,7 +13,6 @@ import errno
 import io
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, Self
 
@@ -142,13 +141,17 @@ class RemoteFile(io.RawIOBase):
 
     def __init__(self, place: RemotePlace, size: int | None = None) -> None:
         super().__init__()
-        self.place = place
-        if size is not None:
-            self.__dict__["_size"] = size
+        self.place, self._size = place, size
         self._position, self._ended = 0, False
 
     def size(self) -> int:
         """Return its length in bytes."""
+        if self._size is None:
+            with connected(self.place) as (system, name):
+                entry = system.info(name)
+            if entry["type"] != "file":
+                raise OSError(errno.EISDIR, "is no object, but a folder of them", str(self.place))
+            self._size = int(entry["size"])
         return self._size
 
     def pread(self, length: int, offset: int) -> bytes:
@@ -162,12 +165,12 @@ class RemoteFile(io.RawIOBase):
                         return read(key, offset, offset + length)
                 options: dict[str, Any] = {}
                 if "hf" in system.protocol:  # It would read ahead, and ask for the size.
-                    options = {"cache_type": "none", "size": self._size}
+                    options = {"cache_type": "none", "size": self.size()}
                 return bytes(system.cat_file(name, start=offset, end=offset + length, **options))
         except (FileNotFoundError, PermissionError):
             raise
         except OSError:
-            if offset < self._size:
+            if offset < self.size():
                 raise
             return b""  # Servers refuse a range that begins after the end.
 
@@ -192,14 +195,6 @@ class RemoteFile(io.RawIOBase):
         self._position += len(data)
         self._ended = len(data) < len(buffer)
         return len(data)
-
-    @cached_property
-    def _size(self) -> int:
-        with connected(self.place) as (system, name):
-            entry = system.info(name)
-        if entry["type"] != "file":
-            raise OSError(errno.EISDIR, "is no object, but a folder of them", str(self.place))
-        return int(entry["size"])
 
 
 class RemoteFolder:

@@ -16,8 +16,7 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -26,6 +25,7 @@ from typing import Any
 
 from slatprep.errors import StoreError
 from slatprep.storage import versions
+from slatprep.storage.atomic import writing
 from slatprep.storage.faults import reached
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.remote import (
@@ -142,7 +142,7 @@ class Upload:
         if self.pointer == self.before.pointer:
             return
         keep = {self.pointer.version, self.pointer.previous}
-        with _refusing(self.target):
+        with writing(str(self.target), self.target):
             # Before the pointer moves, so that builds which begin after that are not listed.
             old = [name for name in list_objects(self.target) if _is_of_version(name, but=keep)]
             self._replace_pointer()
@@ -200,7 +200,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     sizes, content = {**files, **staged.sizes}, versions.content_of(digests)
     if before.pointer is not None and before.pointer.content == content:
         if place is not None:
-            with _refusing(before.target):
+            with writing(str(before.target), before.target):
                 remove_objects(place, list_objects(place))
         return Upload(before, before.pointer)
     previous = before.pointer.version if before.pointer else ""
@@ -208,9 +208,13 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     now = datetime.now(UTC).isoformat(timespec="seconds")
     version = place.name if place else own
     upload = Upload(before, versions.Pointer(version, previous, content, now))
-    with _refusing(before.target):
+    with writing(str(before.target), before.target):
         there = list_objects(upload.version)
-        missing = {name for name in files if not _is_same(there.get(name), new / name)}
+        missing = {
+            name
+            for name, size in files.items()
+            if there.get(name, {}).get("size") != size or not _is_tagged(there[name], new / name)
+        }
         small = [name for name in sorted(missing) if files[name] <= _SMALL_BYTES]
         large = [name for name in sorted(missing) if files[name] > _SMALL_BYTES]
         put_objects(new, upload.version, small)
@@ -222,7 +226,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         there = list_objects(upload.version)
         for name, size in sizes.items():
             arrived = there.get(name, {}).get("size") == size
-            if arrived and name in missing and _is_tagged_otherwise(there[name], new / name):
+            if arrived and name in missing and _is_tagged(there[name], new / name) is False:
                 arrived = file_digest(upload.version / name) == digests[name]
             if not arrived:
                 raise StoreError(
@@ -232,31 +236,21 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     return upload
 
 
-def _is_same(entry: Mapping[str, Any] | None, file: Path) -> bool:
-    """Whether an object surely equals a file: S3 tags most objects by their MD5."""
-    if entry is None or entry["size"] != file.stat().st_size:
-        return False
-    return bool(_tag_in(entry)) and not _is_tagged_otherwise(entry, file)
+def _is_tagged(entry: Mapping[str, Any], file: Path) -> bool | None:
+    """Whether an object's tag is the MD5 of a file, as S3 tags most; None if it is no MD5 at all.
 
-
-def _is_tagged_otherwise(entry: Mapping[str, Any], file: Path) -> bool:
-    """Whether an object's tag looks like an MD5 and is not the file's.
-
-    The object may equal the file even so: where S3 encrypts, a tag is something else.
+    The object may equal the file even if not: where S3 encrypts, a tag is something else.
     """
-    tag = _tag_in(entry)
+    tag = str(entry.get("ETag", "")).strip('"')
+    if not _MD5.fullmatch(tag):
+        return None
     with file.open("rb") as content:
         if "-" not in tag:
-            return tag not in ("", hashlib.file_digest(content, "md5").hexdigest())
+            return tag == hashlib.file_digest(content, "md5").hexdigest()
         # Of several parts: the MD5 of theirs.
         parts = [hashlib.md5(part) for part in iter(partial(content.read, PART_BYTES), b"")]
     whole = hashlib.md5(b"".join(part.digest() for part in parts))
-    return tag != f"{whole.hexdigest()}-{len(parts)}"
-
-
-def _tag_in(entry: Mapping[str, Any]) -> str:
-    tag = str(entry.get("ETag", "")).strip('"')
-    return tag if _MD5.fullmatch(tag) else ""
+    return tag == f"{whole.hexdigest()}-{len(parts)}"
 
 
 def _is_ours(name: str) -> bool:
@@ -270,14 +264,3 @@ def _is_of_version(name: str, but: Iterable[str] = ()) -> bool:
     kind, _, rest = name.partition("/")
     own, kinds = rest.partition("/")[0], (versions.VERSIONS, versions.MANIFESTS)
     return kind in kinds and versions.is_version_name(own) and own not in but
-
-
-@contextmanager
-def _refusing(target: RemotePlace) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StoreError(
-            f"{target}: cannot be written ({error.strerror}); nothing was replaced. Run again when "
-            "it can: what is finished is kept"
-        ) from None

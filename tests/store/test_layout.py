@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -34,30 +35,21 @@ def test_shards_take_every_row_of_every_asset_once_and_in_place(sizes, per_shard
     assert end == offsets[-1]
 
 
-@pytest.mark.parametrize("chunk", [4_096, 128, 2**20])
-def test_shards_are_few_and_small_beside_the_store(chunk):
-    parameters = StoreParameters(voxel_chunk=chunk)
-    sizes = [rows_per_shard(parameters, rows) for rows in (0, 1, 10**6, 10**8, 10**9, 10**10)]
-    assert sizes == sorted(sizes)
-    for rows in (chunk * 64 * 32, chunk * 64 * 32 + 1, chunk * 10_000):
-        size = rows_per_shard(parameters, rows)
-        if size < MAX_VOXEL_SHARD:
-            assert 16 < -(-rows // size) <= MOST_SHARDS <= OPEN_SHARDS
-    assert max(sizes) <= MAX_VOXEL_SHARD
-    given = StoreParameters(voxel_chunk=chunk, voxel_chunks_per_shard=3)
-    assert rows_per_shard(given, 10**9) == 3 * chunk
-
-
 @pytest.mark.parametrize(
-    ("rows", "chunks"),
+    ("rows", "chunk", "chunks"),
     [
-        (0, 64),  # 262,144 rows at least
-        (64 * 32 * 4096, 64),
-        (64 * 32 * 4096 + 1, 128),  # 32 shards would not take the last row
-        (128 * 32 * 4096, 128),
-        (3000 * 32 * 4096, 4096),
-        (10**12, 4096),  # 16.8 million rows at most
+        (0, 4096, 64),  # 262,144 rows at least
+        (64 * 32 * 4096, 4096, 64),
+        (64 * 32 * 4096 + 1, 4096, 128),  # 32 shards would not take the last row
+        (128 * 32 * 4096, 4096, 128),
+        (3000 * 32 * 4096, 4096, 4096),
+        (10**12, 4096, 4096),  # 16.8 million rows at most
+        (64 * 32 * 128 + 1, 128, 128),
+        (10**12, 2**20, MAX_VOXEL_SHARD // 2**20),
     ],
 )
-def test_a_shard_holds_the_least_power_of_two_of_chunks(rows, chunks):
-    assert rows_per_shard(StoreParameters(), rows) == 4096 * chunks
+def test_a_shard_holds_the_least_power_of_two_of_chunks(rows, chunk, chunks):
+    parameters = StoreParameters(voxel_chunk=chunk)
+    assert rows_per_shard(parameters, rows) == chunk * chunks
+    assert rows_per_shard(replace(parameters, voxel_chunks_per_shard=3), rows) == 3 * chunk
+    assert MOST_SHARDS <= OPEN_SHARDS

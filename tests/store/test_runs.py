@@ -84,17 +84,3 @@ def test_shards_are_pieced_together_from_what_is_the_same(drawn, chunk, chunks):
                 if run is not None:
                     rows = old[run.store]
                     assert chunk_of(rows, begin + run.shift, chunk) == chunk_of(new, begin, chunk)
-
-
-def test_shards_of_assets_name_where_their_arrays_lie():
-    parameters = StoreParameters(voxel_chunk=4, voxel_chunks_per_shard=1, grid_assets_per_shard=2)
-    where, runs = ["a", (0, 0), (0, 1), "b", (1, 7)], [Run(1, 3, 0, -1), Run(4, 5, 1, 3)]
-    grids = runs_of(runs, 5, (2, 8))
-    cut = list(shards(where, [0, 1, 2, 3, 4, 5], parameters, {"grid": grids}, {("voxel", 0)}))
-    assert [(shard.group, shard.start, shard.stop) for shard in cut] == [
-        ("voxel", 4, 5), ("grid", 0, 2), ("grid", 2, 4), ("grid", 4, 5), ("record", 0, 5)
-    ]  # fmt: skip
-    assert [list(shard.rows) for shard in cut[1:4]] == [where[:2], where[2:4], where[4:]]
-    assert [shard.pieces for shard in cut[1:4]] == [
-        ((None, 0, 1), (runs[0], 1, 2)), ((runs[0], 2, 3), (None, 3, 4)), ((runs[1], 4, 5),)
-    ]  # fmt: skip

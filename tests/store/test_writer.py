@@ -13,6 +13,7 @@ from slatprep.errors import StoreError
 from slatprep.parameters import StoreParameters
 from slatprep.records import Normalization, PropertyRange
 from slatprep.store.integrity import write_digests
+from slatprep.store.runs import Run, runs_of
 from slatprep.store.writer import Shard, create_store, finish_store, merges, shards
 
 
@@ -37,10 +38,8 @@ def test_arrays_are_cut_as_parameters_say(tmp_path):
     assert cuts["asset/offset"] == ((6,), (6,), None)
     assert cuts["asset/transform"] == ((5, 4, 4), (5, 4, 4), None)
     for name, (_, chunks, outer) in cuts.items():
-        if name.startswith("voxel/"):
-            assert (chunks[0], outer and outer[0]) == (4, 8), name
-        elif name.startswith("grid/"):
-            assert (chunks[0], outer and outer[0]) == (1, 3), name
+        if (group := name.partition("/")[0]) != "asset":
+            assert (chunks[0], outer[0]) == {"voxel": (4, 8), "grid": (1, 3)}[group], name
 
 
 def test_columns_of_many_assets_are_cut(tmp_path):
@@ -80,22 +79,22 @@ def test_shards_of_tasks_are_those_of_the_arrays(tmp_path):
     parameters = StoreParameters(voxel_chunk=1, grid_assets_per_shard=2)
     offsets = [0, 2048, 2049]  # 32 shards of 64 chunks, and one row more than they take
     create_store(tmp_path / "s", 2, offsets[-1], parameters)
-    (size, _) = arrays_of(tmp_path / "s")["voxel/coords"].shards or (0, 0)
-    assert size == 128
+    assert arrays_of(tmp_path / "s")["voxel/coords"].shards == (128, 3)
     every = shards(["a", "b"], offsets, parameters)
     found = [(shard.start, shard.stop) for shard in every if shard.group != "record"]
     assert found == [*((128 * n, 128 * n + 128) for n in range(16)), (2048, 2049), (0, 2)]
 
 
-def test_a_shard_has_the_keys_of_just_those_assets_with_rows_in_it():
+def test_a_shard_says_where_the_arrays_of_just_those_assets_lie_that_have_rows_in_it():
     parameters = StoreParameters(voxel_chunk=4, voxel_chunks_per_shard=2, grid_assets_per_shard=2)
-    assert list(shards(["a", "b", "c"], [0, 5, 12, 20], parameters)) == [
-        Shard("voxel", 0, 8, 0, ["a", "b"], (0, 5, 12), ((None, 0, 8),)),
-        Shard("voxel", 8, 16, 1, ["b", "c"], (5, 12, 20), ((None, 8, 16),)),
-        Shard("voxel", 16, 20, 2, ["c"], (12, 20), ((None, 16, 20),)),
-        Shard("grid", 0, 2, 0, ["a", "b"], (), ((None, 0, 2),)),
-        Shard("grid", 2, 3, 2, ["c"], (), ((None, 2, 3),)),
-        Shard("record", 0, 3, 0, ["a", "b", "c"], (), ((None, 0, 3),)),
+    where, run = ["a", (0, 7), (1, 3)], Run(1, 3, 0, 6)
+    grids = {"grid": runs_of([run], 3, (9,))}
+    assert list(shards(where, [0, 5, 12, 20], parameters, grids, {("voxel", 1)})) == [
+        Shard("voxel", 0, 8, 0, where[:2], (0, 5, 12), ((None, 0, 8),)),
+        Shard("voxel", 16, 20, 2, where[2:], (12, 20), ((None, 16, 20),)),
+        Shard("grid", 0, 2, 0, where[:2], (), ((None, 0, 1), (run, 1, 2))),
+        Shard("grid", 2, 3, 2, where[2:], (), ((run, 2, 3),)),
+        Shard("record", 0, 3, 0, where, (), ((None, 0, 3),)),
     ]
 
 
