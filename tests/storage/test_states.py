@@ -55,14 +55,9 @@ def written(path: Path, content: bytes = b"content") -> Path:
     return path
 
 
-@pytest.mark.parametrize("line", MOUNTS.splitlines())
-def test_only_disks_that_can_be_written_keep_times(line):
-    number = int(line.split()[0])
-    assert keeps_times(MOUNTS, number) is (number in COUNTS)
-
-
-def test_what_is_not_listed_keeps_no_times():
-    assert not keeps_times(MOUNTS, 2)
+def test_only_disks_that_are_listed_and_can_be_written_keep_times():
+    numbers = [int(line.split()[0]) for line in MOUNTS.splitlines()]
+    assert {number for number in [2, *numbers] if keeps_times(MOUNTS, number)} == COUNTS
     assert not keeps_times("", 27)
 
 
@@ -76,11 +71,10 @@ def test_a_state_is_what_the_system_says(on_a_disk):
     assert lasting(path) == state
 
 
-@pytest.mark.parametrize("what", ["folder", "pipe", "nothing", "device", "with NUL"])
-def test_what_is_no_file_has_no_state(on_a_disk, what):
+def test_what_is_no_file_has_no_state(on_a_disk):
     os.mkfifo(on_a_disk / "pipe")
-    path = {"folder": str(on_a_disk), "device": "/dev/null", "with NUL": f"{on_a_disk}/probe\0"}
-    assert States().of(path.get(what, str(on_a_disk / what))) is None
+    for path in ("", "pipe", "nothing", "probe\0", "/dev/null"):
+        assert States().of(path if path[:1] == "/" else f"{on_a_disk}/{path}") is None
 
 
 def test_a_file_that_was_written_just_now_has_no_lasting_state(on_a_disk, monkeypatch):

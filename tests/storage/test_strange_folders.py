@@ -33,26 +33,35 @@ def refused(target: Path, fresh: bool = False) -> str:
     return str(error.value)
 
 
-def test_a_work_folder_that_is_a_link_is_refused(tmp_path, theirs):
-    (tmp_path / ".s.zarr.work").symlink_to(theirs.parent)
-    assert ".s.zarr.work: is no folder" in refused(tmp_path / "s.zarr")
+AS_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="gives something away")
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ("link", ".s.zarr.work: is no folder"),
+        ("made by others", "holds notes.txt"),
+        pytest.param("another user's", "belongs to user 12345", marks=AS_ROOT),
+        ("spool is a link", "spool: is no folder"),
+        ("spool is a file", "spool: is no folder"),
+    ],
+)
+def test_a_work_folder_that_is_not_a_builds_own_is_refused(tmp_path, theirs, how, told):
+    work = tmp_path / ".s.zarr.work"
+    if how == "link":
+        work.symlink_to(theirs.parent)
+    else:
+        work.mkdir()
+    if how == "made by others":
+        shutil.move(theirs, work)
+        theirs = work / theirs.name
+    elif how == "another user's":
+        os.chown(work, 12345, 12345)
+    elif "spool" in how:
+        (work / "lock").touch()
+        (work / "spool").touch() if "file" in how else (work / "spool").symlink_to(theirs.parent)
+    assert told in refused(tmp_path / "s.zarr", fresh="spool" in how)
     assert theirs.read_text() == MINE
-
-
-def test_a_folder_that_no_build_made_is_refused(tmp_path):
-    folder = tmp_path / ".s.zarr.work"
-    folder.mkdir()
-    (folder / "notes.txt").write_text(MINE)
-    assert "holds notes.txt" in refused(tmp_path / "s.zarr")
-    assert (folder / "notes.txt").read_text() == MINE
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="gives a folder away")
-def test_a_work_folder_of_another_user_is_refused(tmp_path):
-    folder = tmp_path / ".s.zarr.work"
-    folder.mkdir()
-    os.chown(folder, 12345, 12345)
-    assert "belongs to user 12345" in refused(tmp_path / "s.zarr")
 
 
 def test_what_is_not_a_builds_own_stays_in_its_folder(tmp_path):
@@ -70,24 +79,6 @@ def test_nobody_else_may_enter_the_work_folder(tmp_path):
         assert work.scratch.parent.stat().st_mode & 0o077 == 0
 
 
-def as_link(place: Path, theirs: Path) -> None:
-    place.symlink_to(theirs.parent)
-
-
-def as_file(place: Path, theirs: Path) -> None:
-    place.write_text(MINE)
-
-
-@pytest.mark.parametrize("put", [as_link, as_file])
-def test_a_spool_that_is_none_is_refused(tmp_path, theirs, put):
-    folder = tmp_path / ".s.zarr.work"
-    folder.mkdir()
-    (folder / "lock").touch()
-    put(folder / "spool", theirs)
-    assert "spool: is no folder" in refused(tmp_path / "s.zarr", fresh=True)
-    assert theirs.read_text() == MINE
-
-
 def test_a_lock_that_is_a_link_or_holds_something_else_is_left_alone(tmp_path, theirs):
     (tmp_path / "lock").symlink_to(theirs)
     with pytest.raises(OSError, match="symbolic links"):
@@ -95,11 +86,6 @@ def test_a_lock_that_is_a_link_or_holds_something_else_is_left_alone(tmp_path, t
     with pytest.raises(StoreError, match="holds something else than a lock"):
         take_lock(theirs, "taken")
     assert theirs.read_text() == MINE
-
-
-def test_a_lock_that_a_killed_process_left_is_taken(tmp_path):
-    for _ in range(2):
-        os.close(take_lock(tmp_path / "lock", "taken"))
 
 
 def test_a_lock_in_a_folder_that_is_gone_is_not_looked_for_without_end(tmp_path, monkeypatch):
@@ -130,30 +116,27 @@ def write_report(folder: Path) -> None:
     assert (folder / "r.html").read_text() == "report"
 
 
-def test_a_link_in_place_of_a_partial_file_is_left_alone(tmp_path, theirs):
-    link = tmp_path / ".r.html.partial"
-    link.symlink_to(theirs)
-    write_report(tmp_path)
-    assert link.is_symlink()
-    assert not (tmp_path / "r.html").is_symlink()
-    assert theirs.read_text() == MINE
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="gives a file away")
-def test_another_users_partial_file_is_left_alone(tmp_path):
+@pytest.mark.parametrize("whose", ["link", pytest.param("another user's", marks=AS_ROOT)])
+def test_a_partial_file_that_is_not_ours_is_left_alone(tmp_path, theirs, whose):
     other = tmp_path / ".r.html.partial"
-    other.write_text(MINE)
-    os.chown(other, 12345, 12345)
+    if whose == "link":
+        other.symlink_to(theirs)
+    else:
+        other.write_text(MINE)
+        os.chown(other, 12345, 12345)
     write_report(tmp_path)
-    assert other.read_text() == MINE
+    assert (other.read_text(), theirs.read_text()) == (MINE, MINE)
+    assert other.is_symlink() is (whose == "link") and not (tmp_path / "r.html").is_symlink()
 
 
-def test_what_a_killed_process_left_of_a_file_is_replaced(tmp_path):
+def test_what_a_killed_process_left_is_replaced(tmp_path):
     (tmp_path / ".r.html.partial").write_text("a longer report, half of")
     write_report(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
     (tmp_path / "any").touch()
     assert (tmp_path / "r.html").stat().st_mode == (tmp_path / "any").stat().st_mode
+    for _ in range(2):
+        os.close(take_lock(tmp_path / "lock", "taken"))
 
 
 def test_two_processes_that_write_one_file_each_write_it_whole(tmp_path):

@@ -9,9 +9,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
-import zarr
 
 from slatprep.errors import StoreError
 from slatprep.pipeline.dataset import BuildSummary
@@ -38,15 +36,10 @@ def test_threads_share_a_store(store):
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_processes_share_a_store(store, method):
     expected = [digest(store, index) for index in range(5)]
+    assert len(pickle.dumps(store)) < 500  # Whatever has been read stays behind.
     with multiprocessing.get_context(method).Pool(2) as pool:
         rows = pool.starmap(Store.read, [(store, index % 5) for index in range(20)])
     assert [[array.tobytes() for array in one.values()] for one in rows] == expected * 4
-
-
-def test_a_pickled_store_is_a_path(store):
-    store.ids  # noqa: B018 - whatever has been read stays behind
-    assert len(pickle.dumps(store)) < 500
-    assert digest(pickle.loads(pickle.dumps(store)), 1) == digest(store, 1)
 
 
 def test_a_replaced_store_is_not_mixed_with_the_new_one(copy):
@@ -155,17 +148,6 @@ def test_hostile_metadata_cost_neither_memory_nor_sense(copy):
     for case, message, grown in answers:
         assert str(copy) in message, case
         assert grown < 100, case
-
-
-def test_offsets_that_lead_astray_are_refused(copy):
-    root = zarr.open_group(copy, mode="r+", use_consolidated=False)
-    for first, message in ((10**12, "asset 0 has rows 0 to"), (-5, "asset 0 has rows 0 to -5")):
-        root["asset/offset"][1] = first
-        with pytest.raises(StoreError, match=message):
-            open_store(copy).read(0)
-    root["asset/offset"][:] = np.arange(6) + 10**6
-    with pytest.raises(StoreError, match=r"voxel/coords has \d+ rows, not 1000000 to 1000001"):
-        open_store(copy).read(0)
 
 
 def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(copy):

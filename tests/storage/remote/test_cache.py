@@ -31,11 +31,11 @@ def test_an_object_that_is_not_there_leaves_no_copy(bucket):
 
 
 def test_where_the_folder_is(monkeypatch, tmp_path):
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "own"))
-    assert cache_folder() == tmp_path / "own"
-    monkeypatch.delenv(VARIABLE)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cache_folder() == tmp_path / "xdg" / "slatprep"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert cache_folder() == tmp_path / "home" / ".cache" / "slatprep"
+    folders = {VARIABLE: "own", "XDG_CACHE_HOME": "xdg", "HOME": "home"}
+    for variable, folder in folders.items():
+        monkeypatch.setenv(variable, str(tmp_path / folder))
+    for variable, found in zip(
+        folders, ("own", "xdg/slatprep", "home/.cache/slatprep"), strict=True
+    ):
+        assert cache_folder() == tmp_path / found
+        monkeypatch.delenv(variable)

@@ -2,7 +2,6 @@
 
 import multiprocessing
 import os
-from typing import Any
 
 import numpy as np
 import pytest
@@ -43,22 +42,18 @@ def test_ranges_and_faults_are_those_of_a_file(bucket, s3):
         RemoteFile(place_of(f"s3://{bucket}/b")).pread(1, 0)  # type: ignore[arg-type]
 
 
-def _read_in_child(bucket: str, answers: Any) -> None:
-    answers.put((range_reader(bucket) is None, RemoteFile(_a(bucket)).pread(4, 3)))
-
-
-def _a(bucket: str) -> Any:
-    return place_of(f"s3://{bucket}/a")
-
-
 @pytest.mark.usefixtures("obstore")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a fork")
 def test_a_forked_process_reads_by_s3fs(bucket, s3):
     s3.pipe_file(f"{bucket}/a", b"0123456789")
-    assert RemoteFile(_a(bucket)).pread(4, 3) == b"3456"
+
+    def read() -> bytes:
+        return RemoteFile(place_of(f"s3://{bucket}/a")).pread(4, 3)  # type: ignore[arg-type]
+
+    assert read() == b"3456"
     forked = multiprocessing.get_context("fork")
     answers = forked.Queue()
-    child = forked.Process(target=_read_in_child, args=(bucket, answers))
+    child = forked.Process(target=lambda: answers.put((range_reader(bucket) is None, read())))
     child.start()
     assert answers.get(timeout=300) == (True, b"3456")
     child.join()
