@@ -13,7 +13,7 @@ from slatprep.cli.signature import command
 from slatprep.errors import StoreError, amount
 
 if TYPE_CHECKING:
-    from slatprep.inspect.difference import AssetChange, StoreDifference
+    from slatprep.inspect.compare import AssetChange, StoreDifference
     from slatprep.records import Place
 
 

@@ -33,6 +33,9 @@ Properties are normalised; converting float32 to SI and back costs digits. Dista
 voxels.
 """
 
+FITNESS = ("fitness", "fitness_backward")
+"""Shares of either side's boundary that are near the other's."""
+
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
 LIMITS = {
@@ -112,10 +115,6 @@ class AlignmentCheck:
     transform: NDArray[np.float64]
     radius: float
 
-    def figure(self, name: str) -> Figure:
-        """Return the figure of that name."""
-        return next(figure for figure in self.figures if figure.name == name)
-
     def value(self, name: str) -> float:
         """Return the value of a figure; NaN if the store does not have it."""
         return next((figure.value for figure in self.figures if figure.name == name), math.nan)
@@ -125,8 +124,7 @@ class AlignmentCheck:
         """The reasons of the verdict: why it is not better, or what makes it good."""
         if self.reasons:
             return self.reasons
-        forward, backward = self.figure("fitness").value, self.figure("fitness_backward").value
-        open_share = self.figure("ambiguity").value
+        forward, backward, open_share = map(self.value, (*FITNESS, "ambiguity"))
         ties = f"the class of {open_share:.1%} of the voxels" if open_share else "no class"
         return (
             f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary lie "
@@ -199,14 +197,9 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
         for name, values in means:
             mean = float(values.mean(dtype=np.float64)) if len(values) else math.nan
             figures.append(Figure(f"mean {name}", mean, mean, 0))
+    said = str(columns["verdict"])
     return AlignmentCheck(
-        asset.asset_id,
-        verdict,
-        reasons,
-        str(columns["verdict"]),
-        tuple(figures),
-        asset.transform,
-        radius,
+        asset.asset_id, verdict, reasons, said, tuple(figures), asset.transform, radius
     )
 
 
@@ -255,7 +248,7 @@ def choose_assets(
     if worst:
         places = {Verdict.FAILED: 0, Verdict.DOUBTFUL: 1, Verdict.GOOD: 2}
         rank = [places.get(verdict, -1) for verdict in store.column("verdict")]
-        fitness = np.minimum(store.column("fitness"), store.column("fitness_backward"))
+        fitness = np.minimum(*map(store.column, FITNESS))
         # Assets without a number come first.
         confidence, fitness = (
             np.nan_to_num(figure, nan=-1.0) for figure in (store.column("confidence"), fitness)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,6 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.geometry.frames import displacement, voxel_centres
-from slatprep.inspect.difference import AssetChange, PropertyChange, Setting, StoreDifference
 from slatprep.normalize import denormalize_properties
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import RESOLUTION, Place
@@ -25,8 +26,123 @@ from slatprep.workers.local import run_in_order
 _ROUNDING = 1e-6
 """Share of a range; rounding to float32 in two normalisations differs by less."""
 
-_Rows = tuple[int, int]
-"""The rows of an asset in the two stores."""
+
+@dataclass(frozen=True)
+class Setting:
+    """An attribute of the stores' roots that differs; None where a store does not have it."""
+
+    name: str
+    a: object
+    b: object
+
+
+@dataclass(frozen=True)
+class PropertyChange:
+    """How a property changed over voxels that are valid in both stores.
+
+    Attributes
+    ----------
+    voxels, changed : int
+        Number of those voxels, and of those whose value differs.
+    mean, most : float
+        Mean and largest absolute change, in the SI unit.
+    log10 : float or None
+        Mean absolute change of log10; None unless both stores normalise it so.
+    """
+
+    voxels: int
+    changed: int
+    mean: float
+    most: float
+    log10: float | None
+
+
+@dataclass(frozen=True)
+class AssetChange:
+    """The change of an asset that is in both stores.
+
+    Attributes
+    ----------
+    asset_id : str
+        Its id.
+    what : tuple of str
+        What differs, in words: ``sources``, ``verdict``, ``placement``, ``voxels``,
+        ``labels``, ``properties``, ``latents``, ``columns``; empty if nothing does.
+    verdicts : tuple of str
+        In the two stores.
+    sources : tuple of str
+        Roles of the source files whose content differs.
+    columns : tuple of str
+        Other arrays that differ, such as ``asset/fitness`` and ``voxel/confidence``.
+    moved : float
+        Mean distance, in voxels of the PixieVerse frame, between the two places where a
+        SLAT voxel is looked up; from the transforms alone if the SLATs have different voxels.
+    voxels, unmatched : int
+        Number of SLAT voxels in both stores, and in only one.
+    labels : int
+        Voxels in both stores whose class differs, or that are valid in only one.
+    properties : dict of str to PropertyChange
+        By name, of the properties in both stores.
+    """
+
+    asset_id: str
+    what: tuple[str, ...]
+    verdicts: tuple[str, str]
+    sources: tuple[str, ...]
+    columns: tuple[str, ...]
+    moved: float
+    voxels: int
+    unmatched: int
+    labels: int
+    properties: dict[str, PropertyChange]
+
+
+@dataclass(frozen=True)
+class StoreDifference:
+    """The differences between two stores.
+
+    Attributes
+    ----------
+    a, b : Place
+        The stores.
+    same : bool
+        Whether there are none.
+    settings : tuple of Setting
+        Attributes that differ: format, ranges, parameters, versions, the digest of the records.
+    only_a, only_b : tuple of str
+        Ids of assets in only one of the stores.
+    assets, changed : int
+        Number of assets in both, and of those that changed.
+    what : dict of str to int
+        Number of changed assets by what differs, see `AssetChange`.
+    verdicts : dict of str to int
+        Changes of the verdict, such as ``good > failed``.
+    moved, moved_most : float
+        Median and maximum of `AssetChange.moved` over the assets that moved; NaN if none did.
+    voxels, labels : int
+        Number of SLAT voxels in both stores, and of those whose class differs.
+    properties : dict of str to PropertyChange
+        Over the voxels of all assets.
+    worst : tuple of AssetChange
+        Assets that changed: those with most changed labels first, then those that moved most.
+    """
+
+    a: Place
+    b: Place
+    same: bool
+    settings: tuple[Setting, ...]
+    only_a: tuple[str, ...]
+    only_b: tuple[str, ...]
+    assets: int
+    changed: int
+    what: dict[str, int]
+    verdicts: dict[str, int]
+    moved: float
+    moved_most: float
+    voxels: int
+    labels: int
+    properties: dict[str, PropertyChange]
+    worst: tuple[AssetChange, ...]
 
 
 def compare_stores(
@@ -71,11 +187,8 @@ def compare_stores(
     only_b = tuple(sorted(rows_b.keys() - set(a.ids)))
     total = _Sum()
     changes = total.of(_changes(a, b, rows, jobs, progress))
-    if worst is None:
-        kept = sorted(changes, key=_how_much, reverse=True)
-    else:
-        kept = heapq.nlargest(worst, changes, key=_how_much)
-    moved = np.array(total.moved)
+    kept = heapq.nlargest(len(rows) if worst is None else worst, changes, key=_how_much)
+    moved = total.moved or [math.nan]
     return StoreDifference(
         a=a.path,
         b=b.path,
@@ -87,8 +200,8 @@ def compare_stores(
         changed=total.changed,
         what=dict(sorted(total.what.items())),
         verdicts=dict(sorted(total.verdicts.items())),
-        moved=float(np.median(moved)) if len(moved) else float("nan"),
-        moved_most=float(moved.max()) if len(moved) else float("nan"),
+        moved=float(np.median(moved)),
+        moved_most=max(moved),
         voxels=total.voxels,
         labels=total.labels,
         properties=total.properties,
@@ -125,19 +238,13 @@ class _Sum:
 
 
 def _sum_of(one: PropertyChange, other: PropertyChange) -> PropertyChange:
-    voxels = one.voxels + other.voxels
-    if not voxels:
-        return one
-    shares = one.voxels / voxels, other.voxels / voxels
-    return PropertyChange(
-        voxels=voxels,
-        changed=one.changed + other.changed,
-        mean=shares[0] * one.mean + shares[1] * other.mean,
-        most=max(one.most, other.most),
-        log10=None
-        if one.log10 is None or other.log10 is None
-        else shares[0] * one.log10 + shares[1] * other.log10,
-    )
+    voxels, log10 = one.voxels + other.voxels, None
+    shares = one.voxels / max(voxels, 1), other.voxels / max(voxels, 1)
+    if one.log10 is not None and other.log10 is not None:
+        log10 = shares[0] * one.log10 + shares[1] * other.log10
+    mean = shares[0] * one.mean + shares[1] * other.mean
+    changed, most = one.changed + other.changed, max(one.most, other.most)
+    return PropertyChange(voxels, changed, mean, most, log10)
 
 
 def _how_much(change: AssetChange) -> tuple[float, ...]:
@@ -156,7 +263,7 @@ def _settings(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> It
 
 
 def _changes(
-    a: Store, b: Store, rows: Sequence[_Rows], jobs: int, progress: Progress | None
+    a: Store, b: Store, rows: Sequence[tuple[int, int]], jobs: int, progress: Progress | None
 ) -> Iterator[AssetChange]:
     """Yield the change of each asset that both stores have."""
     both = [list(own) for own in zip(*rows, strict=True)] or [[], []]
@@ -198,13 +305,12 @@ _WORDS = {"voxel/material": "labels", "voxel/valid": "labels", "voxel/feats": "l
 def _compare(
     source_a: SourceStore,
     source_b: SourceStore,
-    rows: _Rows,
+    rows: tuple[int, int],
     verdicts: tuple[str, str],
     columns: Sequence[str],
 ) -> AssetChange:
     """Compare an asset, in a worker; its verdicts and the `columns` that differ are known."""
-    records = [source.records.read(row) for source, row in zip((source_a, source_b), rows,
-                                                               strict=True)]  # fmt: skip
+    records = source_a.records.read(rows[0]), source_b.records.read(rows[1])
     digests = [{(one.role, one.sha256) for one in record.sources} for record in records]
     roles = {role for role, _ in digests[0] ^ digests[1]}
     a, b = source_a.store, source_b.store
@@ -224,16 +330,15 @@ def _compare(
         other = {name: values[theirs] for name, values in other.items()}
         unmatched = len(codes[0]) + len(codes[1]) - 2 * len(found)
     if unmatched:
-        transforms = [
+        here, there = (
             store.read_rows("asset/transform", row, row + 1)[0]
-            for store, row in zip((b, a), reversed(rows), strict=True)
-        ]
+            for store, row in zip((a, b), rows, strict=True)
+        )
         try:
-            moved = displacement(transforms[0], transforms[1], voxel_centres(coords[0], sides[0]))
+            moved = displacement(there, here, voxel_centres(coords[0], sides[0]))
         except ValueError as error:
-            both = f"{a.path} or {b.path}"
-            what = f"{both}: asset {a.ids[rows[0]]}: {error}; run `slatprep verify`"
-            raise StoreError(what) from None
+            where = f"{a.path} or {b.path}: asset {a.ids[rows[0]]}"
+            raise StoreError(f"{where}: {error}; run `slatprep verify`") from None
     elif not np.array_equal(one["place"], other["place"]):
         apart = other["place"].astype(np.float64) - one["place"]
         moved = float(np.linalg.norm(apart, axis=1).mean() * RESOLUTION)
@@ -244,9 +349,8 @@ def _compare(
     differ += ["coords"] * (not order)
     arrays = [*columns, *(f"voxel/{name}" for name in differ)]
     words = {_WORDS.get(name, "columns") for name in arrays}
-    words |= {"sources"} if roles else set()
-    words |= {"verdict"} if verdicts[0] != verdicts[1] else set()
-    words |= {"placement"} if moved else set()
+    others = {"sources": roles, "verdict": verdicts[0] != verdicts[1], "placement": moved}
+    words |= {word for word, differ in others.items() if differ}
     return AssetChange(
         asset_id=a.ids[rows[0]],
         what=tuple(sorted(words)),
@@ -277,19 +381,20 @@ def _properties(
         column, other_span = spans[span.name]
         both = np.isfinite(one[:, k]) & np.isfinite(other[:, column])
         here, there = si[0][both, k], si[1][both, column]
-        apart, powers = np.abs(there - here), None
-        if span.log10 and other_span.log10:
-            powers = np.abs(np.log10(there) - np.log10(here))
+        apart = mapped = np.abs(there - here)
+        powers = span.log10 and other_span.log10
+        if powers:
+            mapped = np.abs(np.log10(there) - np.log10(here))
         if span == other_span:
             changed = one[both, k] != other[both, column]
         else:
-            changed = (apart if powers is None else powers) > _ROUNDING * (span.hi - span.lo)
+            changed = mapped > _ROUNDING * (span.hi - span.lo)
         changes[span.name] = PropertyChange(
             voxels=len(here),
             changed=int(changed.sum()),
             mean=_mean(apart),
             most=float(apart.max(initial=0.0)),
-            log10=None if powers is None else _mean(powers),
+            log10=_mean(mapped) if powers else None,
         )
     return changes
 

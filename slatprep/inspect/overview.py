@@ -96,8 +96,7 @@ def overview_of(store: Store) -> StoreOverview:
 
 def _group(name: str, columns: dict[str, NDArray[Any]], chosen: list[int]) -> GroupOverview:
     own = {column: values[chosen] for column, values in columns.items()}
-    voxels = int(own["voxels"].sum())
-    verdicts = _counts(own["verdict"])
+    voxels, verdicts = int(own["voxels"].sum()), _counts(own["verdict"])
     return GroupOverview(
         name=name,
         assets=len(chosen),

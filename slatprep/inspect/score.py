@@ -10,7 +10,7 @@ column for each name in ``columns`` (P,).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -162,11 +162,11 @@ def score_against_truth(
 
 def summarise(scores: Sequence[TruthScore]) -> tuple[LevelScore, ...]:
     """Return the score of each level over its assets that have one right placement only."""
-    levels: dict[int, list[TruthScore]] = {}
-    for score in scores:
-        if not score.symmetric:
-            levels.setdefault(score.level, []).append(score)
-    return tuple(_summarise_level(level, levels[level]) for level in sorted(levels))
+    counted = [score for score in scores if not score.symmetric]
+    return tuple(
+        _summarise_level(level, [score for score in counted if score.level == level])
+        for level in sorted({score.level for score in counted})
+    )
 
 
 def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
@@ -193,9 +193,8 @@ def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
         names, values = _true_values(path, len(truth.material))
         known, labels = np.unique(values, axis=0, return_inverse=True)
         if len(known) > MOST_VALUES:
-            raise InputError(
-                path, f"has {len(known)} different rows of properties", f"at most {MOST_VALUES}"
-            )
+            what = f"has {len(known)} different rows of properties"
+            raise InputError(path, what, f"at most {MOST_VALUES}")
         columns = asset.store.columns_of(names)
         truth = replace(truth, material=labels.reshape(-1))
         material = _row_of(asset.properties_si[:, columns], known)
@@ -215,8 +214,7 @@ def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
 
 def _true_values(path: Path, count: int) -> tuple[tuple[str, ...], NDArray[np.floating[Any]]]:
     """Return the true properties (N, P) of SLAT voxels, and their names."""
-    data, _ = load_source(path, path.parent, "truth")
-    arrays = npz_arrays(data, path, _VALUES)
+    arrays = _arrays(path, _VALUES)
     names, values = tuple(map(str, arrays["columns"])), arrays["properties"]
     if values.shape != (count, len(names)):
         raise InputError(path, f"properties has shape {values.shape}", f"({count}, {len(names)})")
@@ -257,16 +255,13 @@ def compare_with_truth(
 
     by_similarity = apply_transform(invert_transform(truth.transform), centres)
     true_places = by_similarity if truth.places is None else truth.places
-    for name, kind, found, expected in (
-        ("material", "class", truth.material, material),
-        ("places", "place", true_places, by_similarity),
+    for name, kind, found, shape in (
+        ("material", "class", truth.material, material.shape),
+        ("places", "place", true_places, by_similarity.shape),
     ):
-        if found.shape != expected.shape:
-            raise InputError(
-                truth.path,
-                f"{name} has shape {found.shape}",
-                f"{expected.shape}, one {kind} for each SLAT voxel of the asset",
-            )
+        if found.shape != shape:
+            wanted = f"{shape}, one {kind} for each SLAT voxel of the asset"
+            raise InputError(truth.path, f"{name} has shape {found.shape}", wanted)
     if places is None:
         places = apply_transform(invert_transform(transform), centres)
     tree = cKDTree(voxel_centres(annotated))
@@ -302,12 +297,16 @@ def _share(flags: NDArray[np.bool_]) -> float:
     return float(flags.mean()) if flags.size else float("nan")
 
 
+def _arrays(path: Path, specs: Mapping[str, ArraySpec], **how: bool) -> dict[str, NDArray[Any]]:
+    data, _ = load_source(path, path.parent, "truth")
+    return npz_arrays(data, path, specs, **how)
+
+
 def read_truth(path: Path) -> Truth:
     """Read one asset's truth; InputError if the file cannot be read, or its numbers are none."""
     try:
-        data, _ = load_source(path, path.parent, "truth")
-        arrays = npz_arrays(data, path, _TRUTH)
-        places = npz_arrays(data, path, _PLACES, partial=True).get("places")
+        arrays = _arrays(path, _TRUTH)
+        places = _arrays(path, _PLACES, partial=True).get("places")
     except InputError as error:
         raise InputError(path, f"cannot be read ({error.fault})", error.expected) from None
     transform = arrays["transform"].astype(np.float64)

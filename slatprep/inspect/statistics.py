@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, product
 from typing import Literal
 
 import numpy as np
@@ -214,9 +214,9 @@ def store_statistics(
     ]
     tasks = ((store.path, some, weight == "asset") for some in portions)
     tallied = zip(portions, run_in_order(_tally_some, tasks, jobs), strict=True)
-    ranges, contents = store.normalization.ranges, store.contents
-    make = _Summariser(store.normalization, contents)
-    total = nothing = no_tally(store.normalization, BINS, contents=contents)
+    ranges, labels = store.normalization.ranges, store.contents.labels
+    make = _Summariser(store.normalization, store.contents)
+    total = nothing = no_tally(store.normalization, BINS, contents=store.contents)
     done, groups = 0, []
     for category, parts in groupby(tallied, lambda part: column[part[0][0]]):
         here, verdicts_here = nothing, Counter[str]()
@@ -229,9 +229,7 @@ def store_statistics(
         total += here
         groups.append(make.group("category", category or UNKNOWN, here, verdicts_here))
     everything = make.group("all", "all", total, Counter(verdict_of[row] for row in rows))
-    classes = [
-        make.group("class", name, total, None, index) for index, name in enumerate(contents.labels)
-    ]
+    classes = [make.group("class", name, total, None, k) for k, name in enumerate(labels)]
     whole = everything.field.share, everything.slat.share
     return StoreStatistics(
         store=store.path,
@@ -249,12 +247,11 @@ def store_statistics(
 
 def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
     """Tally some assets of a store, in a worker."""
-    store = open_store(path)
+    store, names = open_store(path), ("material", "properties")
     ranges, contents = store.normalization, store.contents
     total = no_tally(ranges, BINS, contents=contents)
     for row in rows:
         # Not `store.asset`: it reads all columns of asset/*, which takes long in a large store.
-        names = ("material", "properties")
         field = (store.read_rows(f"grid/{name}", row, row + 1)[0] for name in names)
         slat = store.read(row, names).values()
         total += tally(field, slat, ranges, BINS, contents=contents, by_asset=by_asset)
@@ -278,45 +275,34 @@ class _Summariser:
     ) -> GroupStatistics:
         """Summarise all classes of a tally, or one class by its index."""
         named = {str(v): verdicts[str(v)] for v in Verdict} if verdicts is not None else {}
-        every = np.arange(len(counts.field.weights))
-        chosen = every if index is None else np.array([index])
-        sides = (
-            self._side(side, chosen, sum(named.values()) if index is None else None)
-            for side in (counts.field, counts.slat)
-        )
+        assets = sum(named.values()) if index is None else None
+        sides = (self._side(side, index, assets) for side in (counts.field, counts.slat))
         return GroupStatistics(by, name, named, *sides)
 
-    def _side(
-        self, counts: SideTally, chosen: NDArray[np.int64], assets: int | None
-    ) -> SideStatistics:
-        weights = counts.weights[chosen]
-        annotated = chosen[chosen < len(counts.weights) - 1]
+    def _side(self, counts: SideTally, index: int | None, assets: int | None) -> SideStatistics:
+        """Summarise one side; the last entry of a tally is of voxels without an annotation."""
+        chosen = slice(None) if index is None else slice(index, index + 1)
+        annotated = slice(len(counts.weights) - 1) if index is None else chosen
         own = counts.weights[annotated]
-        whole, part = float(weights.sum()), float(own.sum())
+        whole, part = float(counts.weights[chosen].sum()), float(own.sum())
+        names = self.contents.labels[annotated]
         return SideStatistics(
-            assets=int(counts.assets[chosen[0]]) if assets is None else assets,
+            assets=int(counts.assets[index or 0]) if assets is None else assets,
             voxels=int(counts.voxels[chosen].sum()),
             share=whole,
             unannotated=_ratio(whole - part, whole),
-            classes={
-                self.contents.labels[k]: _ratio(float(counts.weights[k]), part)
-                for k in annotated
-                if k < len(self.contents.labels)
-            },
+            classes={n: _ratio(float(w), part) for n, w in zip(names, own, strict=False)},
             properties={
                 span.name: self._property(counts, number, annotated)
                 for number, span in enumerate(self.ranges.ranges)
             },
         )
 
-    def _property(
-        self, counts: SideTally, number: int, chosen: NDArray[np.int64]
-    ) -> PropertyStatistics:
+    def _property(self, counts: SideTally, number: int, chosen: slice) -> PropertyStatistics:
         span, weights = self.ranges.ranges[number], counts.weights[chosen]
         unit = self.contents.properties[number].unit
-        mean, squares = pooled(
-            weights[None], counts.mean[:, number, chosen], counts.squares[:, number, chosen], axis=1
-        )
+        own = counts.mean[:, number, chosen], counts.squares[:, number, chosen]
+        mean, squares = pooled(weights[None], *own, axis=1)
         total = float(weights.sum())
         if not total:
             nothing = Distribution(*(np.nan,) * 4, dict.fromkeys(QUANTILE_NAMES, np.nan))
@@ -328,14 +314,12 @@ class _Summariser:
         places = np.searchsorted(upto, np.multiply(QUANTILES, upto[-1]))
         found = counts.sums[number, chosen].sum(axis=0)[places] / inside[places]
         normalised = np.array([mean[0], least, most, *np.clip(found, least, most)])
-        mapped = (normalised + 1.0) * 0.5 * (span.hi - span.lo) + span.lo
-        si = 10.0**mapped if span.log10 else mapped
-        spread = float(std[0]) * 0.5 * (span.hi - span.lo)
-        return PropertyStatistics(
-            unit,
-            _distribution(float(mean[1]), float(std[1]), si),
-            _distribution(float(mapped[0]), spread, mapped) if span.log10 else None,
-        )
+        half = 0.5 * (span.hi - span.lo)
+        mapped = (normalised + 1.0) * half + span.lo
+        if not span.log10:
+            return PropertyStatistics(unit, _distribution(mean[1], std[1], mapped), None)
+        log10 = _distribution(mapped[0], std[0] * half, mapped)
+        return PropertyStatistics(unit, _distribution(mean[1], std[1], 10.0**mapped), log10)
 
     def histogram(self, counts: Tally, number: int) -> Histogram:
         """Return a property's histogram by class, in `DRAWN_BINS` bins."""
@@ -359,10 +343,11 @@ class _Summariser:
         )
 
 
-def _distribution(mean: float, std: float, values: NDArray[np.float64]) -> Distribution:
+def _distribution(mean: np.floating, std: np.floating, values: NDArray[np.float64]) -> Distribution:
     """Return a distribution; `values` are the mean, the extremes and the quantiles."""
     least, most, *quantiles = values[1:].tolist()
-    return Distribution(mean, std, least, most, dict(zip(QUANTILE_NAMES, quantiles, strict=True)))
+    named = dict(zip(QUANTILE_NAMES, quantiles, strict=True))
+    return Distribution(float(mean), float(std), least, most, named)
 
 
 def _ratio(part: float, whole: float) -> float:
@@ -385,13 +370,11 @@ COLUMNS = ("by", "name", "side", "assets", "voxels", "share", "unannotated", "pr
 
 def table_of(statistics: StoreStatistics) -> Iterator[tuple[str | int | float, ...]]:
     """Yield a row of `COLUMNS` for each group, side, property and scale."""
-    for group in statistics.groups:
-        for side, own in (("field", group.field), ("slat", group.slat)):
-            which = (group.by, group.name, side, own.assets, own.voxels, own.share, own.unannotated)
-            for name, found in own.properties.items():
-                for scale, values in (("linear", found.si), ("log10", found.log10)):
-                    if values is not None:
-                        quantiles = values.quantiles.values()
-                        ends = (*quantiles, values.most)
-                        yield (*which, name, scale, found.unit, values.mean, values.std,
-                               values.least, *ends)  # fmt: skip
+    for group, side in product(statistics.groups, ("field", "slat")):
+        own: SideStatistics = getattr(group, side)
+        which = (group.by, group.name, side, own.assets, own.voxels, own.share, own.unannotated)
+        for name, found in own.properties.items():
+            for scale, values in (("linear", found.si), ("log10", found.log10)):
+                if values is not None:
+                    yield (*which, name, scale, found.unit, values.mean, values.std, values.least,
+                           *values.quantiles.values(), values.most)  # fmt: skip

@@ -99,7 +99,7 @@ def test_a_store_of_another_grid_is_sound_and_can_be_shown(demo, tmp_path):
     assert thumbnail(asset).shape == (SIDE, 3 * SIDE)
     way = StoredRecords(store).place_map(asset)
     for level in (FULL, COARSE):
-        assert len(encode_asset(asset, way, 2.0, level)) > 100
+        assert len(encode_asset(asset, way, level)) > 100
     picture = ("--picture", tmp_path / "pictures")
     run("check-alignment", "--store", demo / "s.zarr", "--asset", asset.asset_id, *picture)
 

@@ -17,7 +17,6 @@ from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.scene import (
     FARTHEST,
-    Deformed,
     Placed,
     Scene,
     class_colours,
@@ -40,25 +39,17 @@ _LEFT, _TOP, _GAP = 48, 142, 14
 _MOST_LINES = 10
 """Most lines of reasons in the column at the right."""
 
-COLUMNS = (
-    ("before", "PixieVerse classes, SLAT outlined"),
-    ("after", "PixieVerse moved, SLAT outlined"),
-    ("result", "SLAT voxels by class received"),
-    ("error", "distance to PixieVerse, scale at right"),
-)
-"""Heading of each column of a picture, and what it shows."""
-
-DEFORMED_COLUMNS = (
-    COLUMNS[0],
-    ("similarity", "PixieVerse moved, SLAT outlined"),
-    ("deformed", "as the SLAT's voxels look it up"),
-    ("displacement", "by the deformation, scale below"),
-    *COLUMNS[2:],
-)
-"""The same for an alignment with a deformation."""
-
-TIED_COLUMN = ("another", "placement that fits about as well")
-"""Stands before the last two columns where placements are tied."""
+COLUMNS = {
+    "before": "PixieVerse classes, SLAT outlined",
+    "after": "PixieVerse moved, SLAT outlined",
+    "similarity": "PixieVerse moved, SLAT outlined",
+    "deformed": "as the SLAT's voxels look it up",
+    "displacement": "by the deformation, scale below",
+    "another": "placement that fits about as well",
+    "result": "SLAT voxels by class received",
+    "error": "distance to PixieVerse, scale at right",
+}
+"""Heading of each column that a picture can have, in their order, and what it shows."""
 
 
 _SIDE_WIDTH, _SIDE_MARGIN = 402, 48
@@ -81,13 +72,6 @@ _SHOWN = {
 _LINE = 21
 
 
-def columns_of(scene: Scene) -> tuple[tuple[str, str], ...]:
-    """Return the columns of an asset's picture."""
-    columns = COLUMNS if scene.deformed is None else DEFORMED_COLUMNS
-    tied = () if scene.tied is None else (TIED_COLUMN,)
-    return (*columns[:-2], *tied, *columns[-2:])
-
-
 def draw_alignment(
     scene: Scene,
     check: AlignmentCheck,
@@ -105,17 +89,19 @@ def draw_alignment(
     if alignment.open_placements:
         best = max(alignment.open_placements, key=lambda placement: placement.score)
         scene = replace(scene, tied=best.transform)
-    further = len(columns_of(scene)) - len(COLUMNS)
-    figure = canvas.new_figure(WIDTH + further * (PANEL + _GAP), HEIGHT)
-    reasons = _head(figure, check, title, subtitle)
-    _panels(figure, scene, finer)
+    rows = [(view, panels(scene, view)) for view in views(scene, finer * PANEL)]
+    width = WIDTH + (len(rows[0][1]) - 4) * (PANEL + _GAP)
+    figure = canvas.new_figure(width, HEIGHT)
+    left = width - _SIDE_MARGIN - _SIDE_WIDTH
+    reasons = _head(figure, check, title, subtitle, left)
+    _panels(figure, rows, finer)
     _legend(figure, scene)
     tops = [_TOP + row * (PANEL + _GAP) for row in range(3)]
     # Long reasons move the blocks below them down.
-    last = _figures(figure, check, scene, max(tops[0], reasons + 26))
+    last = _figures(figure, check, scene, left, max(tops[0], reasons + 26))
     errors = max(tops[1] + 12, last + 44)
-    _histogram(figure, scene, check.radius, errors)
-    _candidates(figure, alignment, max(tops[2] + 12, errors + 290))
+    _histogram(figure, scene, check.radius, left, errors)
+    _candidates(figure, alignment, left, max(tops[2] + 12, errors + 290))
     return figure
 
 
@@ -143,45 +129,42 @@ def error_picture(scene: Scene, view: View) -> NDArray[np.float64]:
     return draw_voxels(scene.surface, colours, np.eye(4), view, contrast=0.35).rgb
 
 
-def panels(scene: Scene, view: View) -> tuple[NDArray[np.float64], ...]:
-    """Draw one row of a picture: `columns_of` it, each (n, n, 3) in 0..1."""
-    field = scene.pixieverse, scene.pixieverse_material
-    sets: list[Placed] = [(*field, np.eye(4)), (*field, scene.transform)]
-    moved = []
+def panels(scene: Scene, view: View) -> dict[str, NDArray[np.float64]]:
+    """Draw one row of a picture: the `COLUMNS` that it has, each (n, n, 3) in 0..1."""
+    sets = {"before": scene.before, "after": scene.after}
     if scene.deformed is not None:
-        sets.append(scene.placed)
-        shares = scene.deformed.displacement
-        colours = distance_colours(shares, displacement_scale(scene.deformed))
-        moved.append(draw_voxels(scene.slat, colours, np.eye(4), view, contrast=0.35).rgb)
+        sets = {"before": scene.before, "similarity": scene.after, "deformed": scene.deformed}
+    if scene.tied is not None:
+        sets["another"] = scene.before._replace(transform=scene.tied)
+    drawn = dict(zip(sets, outlined(scene, view, *sets.values()), strict=True))
+    if scene.deformed is not None:
+        colours = distance_colours(scene.displacement, scene.displacement_scale)
+        moved = draw_voxels(scene.slat, colours, np.eye(4), view, contrast=0.35)
+        drawn["displacement"] = moved.rgb
     result = draw_voxels(scene.slat, class_colours(scene.slat_material), np.eye(4), view)
-    tied = [] if scene.tied is None else outlined(scene, view, (*field, scene.tied))
-    shown = *outlined(scene, view, *sets), *moved, *tied
-    return (*shown, result.rgb, error_picture(scene, view))
-
-
-def displacement_scale(deformed: Deformed) -> float:
-    """Return the end of the scale of displacements: the largest one, rounded up to a voxel."""
-    return max(float(np.ceil(deformed.displacement.max())), 1.0)
+    drawn |= {"result": result.rgb, "error": error_picture(scene, view)}
+    return {name: drawn[name] for name in COLUMNS if name in drawn}
 
 
 def _outline(drawing: Drawing) -> NDArray[np.float64]:
     """Return the outline of a drawing, about two pixels wide."""
-    cover = np.pad(drawing.cover, 2)
-    n = len(drawing.cover)
-    disc = [(1, 2), (2, 1), (2, 3), (3, 2), (2, 2), (1, 1), (1, 3), (3, 1), (3, 3)]
-    shifted = np.stack([cover[y : y + n, x : x + n] for y, x in disc])
-    return np.asarray(np.clip(shifted.max(axis=0) - shifted.min(axis=0), 0, 1))
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    most, least = (f(drawing.cover, 3, mode="constant") for f in (maximum_filter, minimum_filter))
+    return np.asarray(most - least)
 
 
-def _panels(figure: Figure, scene: Scene, finer: int) -> None:
-    for column, (name, meaning) in enumerate(columns_of(scene)):
-        x = _LEFT + column * (PANEL + _GAP)
-        canvas.write(figure, x, _TOP - 30, name, weight="bold", size=9)
-        canvas.write(figure, x, _TOP - 10, meaning, color=canvas.MUTED, size=6.8)
-    for row, view in enumerate(views(scene, finer * PANEL)):
+def _panels(
+    figure: Figure, rows: list[tuple[View, dict[str, NDArray[np.float64]]]], finer: int
+) -> None:
+    for row, (view, images) in enumerate(rows):
         y = _TOP + row * (PANEL + _GAP)
-        for column, image in enumerate(panels(scene, view)):
-            canvas.draw_image(figure, _LEFT + column * (PANEL + _GAP), y, image, finer)
+        for column, (name, image) in enumerate(images.items()):
+            x = _LEFT + column * (PANEL + _GAP)
+            canvas.draw_image(figure, x, y, image, finer)
+            if row == 0:
+                canvas.write(figure, x, y - 30, name, weight="bold", size=9)
+                canvas.note(figure, x, y - 10, COLUMNS[name], 6.8)
         _axes_triad(figure, view, _LEFT + 6, y + PANEL - 34)
 
 
@@ -189,18 +172,16 @@ def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
     for k, name in enumerate("xyz"):
         dx, dy = 20 * view.rotation[:2, k]
         canvas.draw_line(figure, x + 12, y, (x + 12 + dx, y - dy), canvas.MUTED)
-        canvas.write(
-            figure, x + 12 + 1.45 * dx, y - 1.45 * dy, name, size=6, color=canvas.MUTED,
-            ha="center", va="center_baseline",
-        )  # fmt: skip
+        at = x + 12 + 1.45 * dx, y - 1.45 * dy
+        canvas.note(figure, *at, name, 6, ha="center", va="center_baseline")
 
 
-def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> int:
+def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str, left: float) -> int:
     """Write title, verdict and reasons; return the height of the last reason."""
     colour, bold = canvas.VERDICT_COLOURS[check.verdict], {"weight": "bold", "size": 13}
     canvas.write(figure, _LEFT, 50, title, **bold)
-    canvas.write(figure, _LEFT, 76, subtitle, size=7.5, color=canvas.MUTED)
-    canvas.write(figure, _side_of(figure), 50, f"alignment {check.verdict}", color=colour, **bold)
+    canvas.note(figure, _LEFT, 76, subtitle, 7.5)
+    canvas.write(figure, left, 50, f"alignment {check.verdict}", color=colour, **bold)
     reasons = list(check.words)
     if not check.consistent:
         reasons.append("the store's figures do not all agree with its voxels")
@@ -208,13 +189,13 @@ def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str) -> i
     if len(lines) > _MOST_LINES:
         lines = [*lines[: _MOST_LINES - 1], "and more: `slatprep check-alignment` prints all"]
     for number, line in enumerate(lines):
-        canvas.write(figure, _side_of(figure), 74 + 17 * number, line, size=7, color=canvas.MUTED)
+        canvas.note(figure, left, 74 + 17 * number, line)
     return 74 + 17 * (len(lines) - 1)
 
 
 def _legend(figure: Figure, scene: Scene) -> None:
     y = _TOP + 3 * (PANEL + _GAP) + 12
-    present = np.union1d(scene.pixieverse_material, scene.slat_material)
+    present = np.union1d(scene.before.material, scene.slat_material)
     share = np.bincount(scene.slat_material, minlength=256) / max(len(scene.slat_material), 1)
     if len(present) > len(MATERIAL_CLASSES):  # Perhaps not all find room: the largest do.
         present = present[np.argsort(-share[present], kind="stable")]
@@ -222,13 +203,11 @@ def _legend(figure: Figure, scene: Scene) -> None:
     entries = [(f"{names[k]}  {share[k]:.1%}", MATERIAL_COLOURS[int(k)]) for k in present]
     columns = 4 if scene.deformed is None else 3  # The fourth is above the scale.
     end = _LEFT + columns * (PANEL + _GAP) - _GAP
-    words = "share of the SLAT voxels"
-    canvas.draw_legend(
-        figure, entries, (_LEFT, y, end - 190), edgecolor=canvas.MUTED, linewidth=0.5
-    )
-    canvas.write(figure, end, y, words, size=6.8, color=canvas.MUTED, ha="right")
+    box = _LEFT, y, end - 190
+    canvas.draw_legend(figure, entries, box, edgecolor=canvas.MUTED, linewidth=0.5)
+    canvas.note(figure, end, y, "share of the SLAT voxels", 6.8, ha="right")
     if scene.deformed is not None:
-        _scale(figure, displacement_scale(scene.deformed), _LEFT + 3 * (PANEL + _GAP), y)
+        _scale(figure, scene.displacement_scale, _LEFT + 3 * (PANEL + _GAP), y)
 
 
 def _scale(figure: Figure, farthest: float, x: int, y: int) -> None:
@@ -236,24 +215,16 @@ def _scale(figure: Figure, farthest: float, x: int, y: int) -> None:
     along = np.linspace(0.0, farthest, PANEL)
     bar = np.broadcast_to(distance_colours(along, farthest)[None], (10, PANEL, 3))
     canvas.draw_image(figure, x, y - 9, bar)
-    ends = ((x, "0", "left"), (x + PANEL / 2, f"{farthest / 2:g}", "center"),
-            (x + PANEL, f"{farthest:g} voxels", "right"))  # fmt: skip
-    for at, words, ha in ends:
-        canvas.write(figure, at, y + 17, words, size=6.8, color=canvas.MUTED, ha=ha)
+    words = ("0", f"{farthest / 2:g}", f"{farthest:g} voxels")
+    for k, ha in enumerate(("left", "center", "right")):
+        canvas.note(figure, x + k * PANEL / 2, y + 17, words[k], 6.8, ha=ha)
 
 
-def _side_of(figure: Figure) -> float:
-    """Return the left edge of the column in pixels."""
-    return canvas.size_of(figure)[0] - _SIDE_MARGIN - _SIDE_WIDTH
-
-
-def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> float:
+def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y: float) -> float:
     """Write figures, thresholds and the size of the map; return the height of the last line."""
-    left = _side_of(figure)
     columns = (left, left + 275, left + _SIDE_WIDTH)
-    for x, name, ha in zip(columns, ("figure", "value", "good"), ("left", "right", "right"),
-                           strict=True):  # fmt: skip
-        canvas.write(figure, x, y, name, size=6.8, color=canvas.MUTED, ha=ha)
+    for x, name in zip(columns, ("figure", "value", "good"), strict=True):
+        canvas.note(figure, x, y, name, 6.8, ha="left" if x == left else "right")
     canvas.draw_line(figure, left, y + 7, (left + _SIDE_WIDTH, y + 7), canvas.RULE)
     rows = [one for name in _SHOWN for one in check.figures if one.name == name]
     for number, one in enumerate(rows):
@@ -265,7 +236,7 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> f
         value = "-" if np.isnan(one.value) else f"{round(one.value, 3) + 0.0:.3f}"
         canvas.write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
         limit = one.threshold_text.replace(">=", "\u2265").replace("<=", "\u2264")
-        canvas.write(figure, columns[2] - 26, line, limit, size=7.5, ha="right", color=canvas.MUTED)
+        canvas.note(figure, columns[2] - 26, line, limit, 7.5, ha="right")
         if one.passes is not None:
             mark = "\u2717" if worse else "\u2713"
             good = canvas.VERDICT_COLOURS["failed" if worse else "good"]
@@ -275,27 +246,23 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, y: float) -> f
     moved = np.linalg.norm(shift) * RESOLUTION
     words = f"turned {angle:.1f}°, shifted {moved:.2f} voxel, scaled {scale:.3f}"
     line = y + 36 + _LINE * len(rows)
-    canvas.write(figure, left, line, words, size=7, color=canvas.MUTED)
+    canvas.note(figure, left, line, words)
     if scene.deformed is not None:
-        apart = scene.deformed.displacement
+        apart = scene.displacement
         words = f"deformed by {apart.mean():.2f} voxel in the mean, {apart.max():.2f} at most"
         line += 17
-        canvas.write(figure, left, line, words, size=7, color=canvas.MUTED)
+        canvas.note(figure, left, line, words)
     return line
 
 
-def _histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
+def _histogram(figure: Figure, scene: Scene, radius: float, left: float, y: float) -> None:
     """Draw the histogram of errors, and as a line that of the errors before."""
-    canvas.write(
-        figure, _side_of(figure), y, "error per SLAT surface voxel", weight="bold", size=8.5
-    )
     share = float((scene.error <= radius).mean())
     before = "before" if scene.deformed is None else "undeformed"
     words = (
         f"median {np.median(scene.error):.2f} voxel, {share:.1%} within {radius:g}; line: {before}"
     )
-    canvas.write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
-    axes = _axes(figure, y + 36, 190)
+    axes = _plot(figure, left, y, "error per SLAT surface voxel", words)
     edges = np.linspace(0, FARTHEST, 31)
     middles = (edges[:-1] + edges[1:]) / 2
     shares = [
@@ -313,18 +280,15 @@ def _histogram(figure: Figure, scene: Scene, radius: float, y: float) -> None:
     axes.locator_params(axis="y", nbins=3)
 
 
-def _candidates(figure: Figure, alignment: Alignment, y: float) -> None:
+def _candidates(figure: Figure, alignment: Alignment, left: float, y: float) -> None:
     """Draw the coarse fitness of each distinct start, the best first."""
-    candidates = alignment.candidates
-    canvas.write(figure, _side_of(figure), y, "starts of the search", weight="bold", size=8.5)
+    candidates, heading = alignment.candidates, "starts of the search"
     if not candidates:
-        words = "none are recorded"
-        canvas.write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
+        _heading(figure, left, y, heading, "none are recorded")
         return
     own = sorted((c for c in candidates if c.same_as is None), key=lambda c: (-c.fitness, c.index))
     words = f"{len(own)} distinct of {len(candidates)}, by coarse fitness"
-    canvas.write(figure, _side_of(figure), y + 20, words, size=7, color=canvas.MUTED)
-    axes = _axes(figure, y + 36, 190)
+    axes = _plot(figure, left, y, heading, words)
     wide = alignment.search is Search.SO3
     colours = [canvas.RULE if wide else canvas.ACCENT] + [canvas.RULE] * (len(own) - 1)
     axes.bar(range(len(own)), [c.fitness for c in own], width=0.78, color=colours)
@@ -342,8 +306,15 @@ def _candidates(figure: Figure, alignment: Alignment, y: float) -> None:
         axes.set_xticks([])
 
 
-def _axes(figure: Figure, y: float, height: float) -> Axes:
-    axes = canvas.add_axes(figure, _side_of(figure) + 40, y, _SIDE_WIDTH - 40, height)
+def _heading(figure: Figure, left: float, y: float, heading: str, words: str) -> None:
+    canvas.write(figure, left, y, heading, weight="bold", size=8.5)
+    canvas.note(figure, left, y + 20, words)
+
+
+def _plot(figure: Figure, left: float, y: float, heading: str, words: str) -> Axes:
+    """Return axes below a heading in the column at the right."""
+    _heading(figure, left, y, heading, words)
+    axes = canvas.add_axes(figure, left + 40, y + 36, _SIDE_WIDTH - 40, 190)
     axes.tick_params(length=2.5, width=0.6)
     for spine in axes.spines.values():
         spine.set_linewidth(0.6)

@@ -97,6 +97,11 @@ def write(figure: Figure, x: float, y: float, words: str, **style: Any) -> None:
     figure.text(x / width, 1 - y / height, words, parse_math=False, **style)
 
 
+def note(figure: Figure, x: float, y: float, words: str, size: float = 7.0, **style: Any) -> None:
+    """Write small text in the secondary colour."""
+    write(figure, x, y, words, size=size, color=MUTED, **style)
+
+
 def draw_image(figure: Figure, x: int, y: int, image: NDArray[np.float64], finer: int = 1) -> None:
     """Put an image (rows, columns, 3) in 0..1 at a pixel, with `finer` of its pixels to one."""
     pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
@@ -155,7 +160,7 @@ def draw_legend(
         more = f"and {len(entries) - number} more"
         after = 28 + 9.2 * len(more) if number + 1 < len(entries) and y == last else 0.0
         if number == MOST_NAMES or (x > left and x + wide + after > right):
-            write(figure, x, y, more, size=7.5, color=MUTED)
+            note(figure, x, y, more, 7.5)
             return
         place = x / width, 1 - (y + 1) / height
         square = Rectangle(place, 13 / width, 13 / height, facecolor=colour, **style)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.frames import (
     VOXEL_SIZE,
     apply_transform,
-    places_of,
     split_transform,
     voxel_centres,
 )
 from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
 from slatprep.inspect.pictures.canvas import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
-from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION
+from slatprep.records import MATERIAL_COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset
 from slatprep.store.records import StoredRecords
 
@@ -28,8 +28,13 @@ FARTHEST = 3.0
 VIEWPOINTS = ((300.0, 22.0), (60.0, 22.0), (205.0, 50.0))
 """Azimuth and elevation [degree] of the three views of a picture."""
 
-Placed = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]
-"""Voxels (K, 3), the class of each (K,), and the transform (4, 4) that puts them in a picture."""
+
+class Placed(NamedTuple):
+    """Voxels (K, 3), the class of each (K,), and the transform (4, 4) to the picture's frame."""
+
+    voxels: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    transform: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,65 +43,50 @@ class Scene:
 
     Attributes
     ----------
-    pixieverse : ndarray of uint8, shape (K, 3)
-        Boundary voxels of the PixieVerse field, PixieVerse frame.
-    pixieverse_material : ndarray of uint8, shape (K,)
-        Their classes; 255 if not annotated.
+    before, after : Placed
+        Boundary voxels of the PixieVerse field, in its own frame and moved by the transform; class
+        255 if not annotated.
     slat : ndarray of uint8, shape (N, 3)
         Cells of the 64^3 grid that SLAT voxels occupy.
     slat_material : ndarray of uint8, shape (N,)
         Their classes by the lookup; 255 if not valid.
-    transform : ndarray of float64, shape (4, 4)
-        PixieVerse frame to SLAT frame.
     surface : ndarray of uint8, shape (M, 3)
         The SLAT's outer voxels, on which errors are measured.
     error, error_before : ndarray of float64, shape (M,)
         Distance [voxel] of each to the nearest outer voxel of the PixieVerse field, after and
         before the alignment. With a deformation, "before" is under the transform alone.
-    deformed : Deformed or None
-        The deformation, if the asset has one.
+    deformed : Placed or None
+        If the asset has a deformation, the deformed PixieVerse field on the SLAT's grid: boundary
+        of the cells whose centre maps into an occupied voxel.
+    displacement : ndarray of float64, shape (N,)
+        Distance [voxel] by which the deformation moves the place of each SLAT voxel.
     labels : tuple of str
         Names of the classes.
     tied : ndarray of float64, shape (4, 4), or None
         The best of the other placements that fit about as well, if there are such.
     """
 
-    pixieverse: NDArray[np.uint8]
-    pixieverse_material: NDArray[np.uint8]
+    before: Placed
+    after: Placed
     slat: NDArray[np.uint8]
     slat_material: NDArray[np.uint8]
-    transform: NDArray[np.float64]
     surface: NDArray[np.uint8]
     error: NDArray[np.float64]
     error_before: NDArray[np.float64]
-    deformed: Deformed | None = None
-    labels: tuple[str, ...] = MATERIAL_CLASSES
+    deformed: Placed | None
+    displacement: NDArray[np.float64]
+    labels: tuple[str, ...]
     tied: NDArray[np.float64] | None = None
 
     @property
     def placed(self) -> Placed:
         """The PixieVerse field in the SLAT frame, deformation included."""
-        if self.deformed is not None:
-            return self.deformed.voxels, self.deformed.material, np.eye(4)
-        return self.pixieverse, self.pixieverse_material, self.transform
+        return self.deformed or self.after
 
-
-@dataclass(frozen=True)
-class Deformed:
-    """The effect of a deformation on an asset.
-
-    Attributes
-    ----------
-    voxels, material : ndarray of uint8, shapes (D, 3) and (D,)
-        The deformed PixieVerse field on the SLAT's grid: boundary of the cells whose centre
-        maps into an occupied voxel.
-    displacement : ndarray of float64, shape (N,)
-        Distance [voxel] by which it moves the place of each SLAT voxel.
-    """
-
-    voxels: NDArray[np.uint8]
-    material: NDArray[np.uint8]
-    displacement: NDArray[np.float64]
+    @property
+    def displacement_scale(self) -> float:
+        """The end of the scale of displacements: the largest one, rounded up to a voxel."""
+        return max(float(np.ceil(self.displacement.max())), 1.0)
 
 
 def scene_of(asset: StoredAsset) -> Scene:
@@ -110,27 +100,25 @@ def scene_of(asset: StoredAsset) -> Scene:
     cells, row = asset.cells
     surface = outer_boundary(occupancy_of(cells))
     way = StoredRecords(asset.store).place_map(asset)
-    under = surface_distance(surface, outer, asset.transform)
-    if way.deformation is None:
-        deformed, error, before = None, under, surface_distance(surface, outer, np.eye(4))
-    else:
-        deformed = _deformed(asset, way, row)
-        error, before = surface_distance(surface, outer, asset.transform, way), under
+    similar = PlaceMap(asset.transform)
+    before = PlaceMap(np.eye(4)) if way.deformation is None else similar
+    moved = asset.place - similar.to_pixieverse(asset.latents.centres)
+    field = Placed(shell, asset.grid_material[tuple(shell.T)], np.eye(4))
     return Scene(
-        pixieverse=shell,
-        pixieverse_material=asset.grid_material[tuple(shell.T)],
+        before=field,
+        after=field._replace(transform=asset.transform),
         slat=cells,
         slat_material=asset.material[row],
-        transform=asset.transform,
         surface=surface,
-        error=error,
-        error_before=before,
-        deformed=deformed,
+        error=surface_distance(surface, outer, way),
+        error_before=surface_distance(surface, outer, before),
+        deformed=None if way.deformation is None else _deformed(asset, way),
+        displacement=np.linalg.norm(moved[row], axis=1) / VOXEL_SIZE,
         labels=asset.store.contents.labels,
     )
 
 
-def _deformed(asset: StoredAsset, way: PlaceMap, row: NDArray[np.intp]) -> Deformed:
+def _deformed(asset: StoredAsset, way: PlaceMap) -> Placed:
     cells = np.indices((RESOLUTION,) * 3, dtype=np.uint8).reshape(3, -1).T
     found = np.rint((way.places(cells) + 0.5) * RESOLUTION - 0.5).astype(np.intp)
     inside = ((found >= 0) & (found < RESOLUTION)).all(axis=1)
@@ -139,37 +127,28 @@ def _deformed(asset: StoredAsset, way: PlaceMap, row: NDArray[np.intp]) -> Defor
     material[inside] = asset.grid_material[tuple(found[inside].T)]
     grid = material.reshape((RESOLUTION,) * 3)
     shell = voxels_of(boundary(grid != background))
-    moved = (asset.place - places_of(asset.latents.centres, asset.transform))[row]
-    return Deformed(shell, grid[tuple(shell.T)], np.linalg.norm(moved, axis=1) / VOXEL_SIZE)
+    return Placed(shell, grid[tuple(shell.T)], np.eye(4))
 
 
 def surface_distance(
-    slat: NDArray[np.uint8],
-    pixieverse: NDArray[np.uint8],
-    transform: ArrayLike,
-    way: PlaceMap | None = None,
+    slat: NDArray[np.uint8], pixieverse: NDArray[np.uint8], way: PlaceMap
 ) -> NDArray[np.float64]:
     """Return the distance (M,) [voxel] of each SLAT voxel to the nearest PixieVerse voxel.
 
-    Surface voxels (M, 3) and (K, 3) are each in their own frame. `transform` leads from the
-    PixieVerse frame to the SLAT's; `way` is the whole map if it is more than that.
+    Surface voxels (M, 3) and (K, 3) are each in their own frame.
     """
     from slatprep.geometry.nearest import Lattice
 
-    _, _, scale = split_transform(transform)
-    points = voxel_centres(slat)
-    points = places_of(points, transform) if way is None else way.to_pixieverse(points)
-    distance, _ = Lattice(pixieverse).nearest(points)
+    _, _, scale = split_transform(way.transform)
+    distance, _ = Lattice(pixieverse).nearest(way.to_pixieverse(voxel_centres(slat)))
     return np.asarray(distance * scale)
 
 
 def views(scene: Scene, size: int) -> tuple[View, ...]:
     """Return the three views, at one scale at which the sets fit before and after."""
-    here = voxel_centres(scene.pixieverse)
-    voxels, _, transform = scene.placed
-    moved = apply_transform(scene.transform, here)
-    after = apply_transform(transform, voxel_centres(voxels))
-    points = np.concatenate([here, moved, after, voxel_centres(scene.slat)])
+    sets = (scene.before, scene.after, scene.placed)
+    field = [apply_transform(one.transform, voxel_centres(one.voxels)) for one in sets]
+    points = np.concatenate([*field, voxel_centres(scene.slat)])
     placed = []
     for azimuth, elevation in VIEWPOINTS:
         rotation = view_rotation(azimuth, elevation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,9 +50,8 @@ def draw_statistics(store: Store, statistics: StoreStatistics, kind: str = "png"
                 _histogram(_axes(figure, column, top, _HISTOGRAM), histogram, side)
                 top += _HISTOGRAM + _BETWEEN
             if statistics.joint is not None:
-                _joint(
-                    figure, _axes(figure, column, top, _JOINT), statistics, statistics.joint, side
-                )
+                axes = _axes(figure, column, top, _JOINT)
+                _joint(axes, statistics.histograms, statistics.joint, side)
                 top += joint
             bars = [getattr(group, side).classes for group in shown]
             names = [f"{canvas.cut(group.name, 14)} ({group.slat.assets:,})" for group in shown]
@@ -69,7 +69,7 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
         f"every {what} one; not annotated: {_percent(statistics.total.field.unannotated)} before, "
         f"{_percent(statistics.total.slat.unannotated)} after"
     )
-    canvas.write(figure, 40, 74, words, size=7, color=canvas.MUTED)
+    canvas.note(figure, 40, 74, words)
     entries = [
         (group.name, colour)
         for group, colour in zip(statistics.classes, _COLOURS, strict=False)
@@ -99,20 +99,18 @@ def _histogram(axes: Axes, histogram: Histogram, side: str) -> None:
     axes.set_ylabel("share")
 
 
-def _joint(
-    figure: Figure, axes: Axes, statistics: StoreStatistics, joint: JointHistogram, side: str
-) -> None:
+def _joint(axes: Axes, histograms: Sequence[Histogram], joint: JointHistogram, side: str) -> None:
     from matplotlib.colors import LinearSegmentedColormap, LogNorm
 
     shares = np.ma.masked_equal(_shares(getattr(joint, side)), 0.0)
-    first, second = (one for one in statistics.histograms if one.name in joint.names)
+    first, second = (one for one in histograms if one.name in joint.names)
     colours = LinearSegmentedColormap.from_list("shares", canvas.DISTANCE_COLOURS[1:])
     # The scale ends at 1e-5; smaller shares have its palest colour.
     mesh = axes.pcolormesh(
         *joint.edges, shares.T, cmap=colours, norm=LogNorm(1e-5, 1.0), rasterized=True
     )
     if side == _SIDES[-1][0]:
-        bar = figure.colorbar(mesh, cax=axes.inset_axes((1.02, 0, 0.02, 1)))
+        bar = axes.figure.colorbar(mesh, cax=axes.inset_axes((1.02, 0, 0.02, 1)))
         bar.outline.set_visible(False)
         bar.set_label("share of voxels")
     axes.set_xlim(first.edges[0], first.edges[-1])
@@ -160,19 +158,13 @@ def draw_errors(errors: MeasuredErrors, name: str, kind: str = "png") -> bytes:
         figure = canvas.new_figure(1200, 640)
         canvas.write(figure, 40, 48, f"Same object? {name}", weight="bold", size=12)
         for row, sentence in enumerate(errors.sentences()):
-            canvas.write(figure, 40, 76 + 22 * row, sentence, size=7, color=canvas.MUTED)
+            canvas.note(figure, 40, 76 + 22 * row, sentence)
         axes = figure.add_axes((0.07, 0.13, 0.9, 0.6))
         axes.bar(edges[:-1], errors.targets, np.diff(edges), align="edge", color=canvas.ACCENT,
                  alpha=0.7, label=f"{errors.assets:,} alignments of the dataset")  # fmt: skip
         decoys = f"{len(errors.decoys):,} decoys: grids with SLATs of other objects"
-        axes.step(
-            edges,
-            [*counts, counts[-1]],
-            where="post",
-            color=canvas.VERDICT_COLOURS["failed"],
-            lw=1.6,
-            label=decoys,
-        )
+        axes.step(edges, [*counts, counts[-1]], where="post", lw=1.6, label=decoys,
+                  color=canvas.VERDICT_COLOURS["failed"])  # fmt: skip
         for kept in errors.kept:
             if kept.rate in RATES and kept.assets:
                 axes.axvline(kept.score, color=canvas.INK, lw=1, ls=RATES[kept.rate],

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slatprep.geometry.frames import apply_transform
 from slatprep.geometry.voxels import occupancy_of
-from slatprep.inspect.pictures.scene import Scene, class_colours, distance_colours
+from slatprep.inspect.pictures.scene import Placed, Scene, class_colours, distance_colours
 from slatprep.records import RESOLUTION
 
 APART = 1.25
@@ -57,20 +58,14 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]
 
 def meshes(scene: Scene) -> tuple[Mesh, ...]:
     """Return the four parts side by side along x, in the SLAT frame."""
-    identity = np.eye(4)
-    classes = class_colours(scene.pixieverse_material)
-    placed = scene.placed
-    parts = (
-        (scene.pixieverse, classes, identity),
-        (placed[0], class_colours(placed[1]), placed[2]),
-        (scene.slat, class_colours(scene.slat_material), identity),
-        (scene.surface, distance_colours(scene.error), identity),
+    slat = Placed(scene.slat, scene.slat_material, np.eye(4))
+    by_class = (scene.before, scene.placed, slat)
+    parts = [cube_mesh(one.voxels, class_colours(one.material), one.transform) for one in by_class]
+    parts.append(cube_mesh(scene.surface, distance_colours(scene.error), np.eye(4)))
+    return tuple(
+        (vertices + APART * number * np.eye(3)[0], triangles, colours)
+        for number, (vertices, triangles, colours) in enumerate(parts)
     )
-    done = []
-    for number, (voxels, colours, transform) in enumerate(parts):
-        vertices, triangles, painted = cube_mesh(voxels, colours, transform)
-        done.append((vertices + APART * number * np.eye(3)[0], triangles, painted))
-    return tuple(done)
 
 
 def cube_mesh(
@@ -84,14 +79,12 @@ def cube_mesh(
     empty = ~np.pad(occupancy_of(voxels), 1)
     corners, painted = [], []
     unit = np.eye(3, dtype=np.intp)
-    for axis in range(3):
-        for sign in (1, -1):
-            beside = voxels + 1 + sign * unit[axis]
-            exposed = empty[tuple(beside.T)]
-            u, v = (unit[(axis + 1) % 3], unit[(axis + 2) % 3])[::sign]
-            origin = voxels[exposed] + (unit[axis] if sign > 0 else 0)
-            corners.append(origin[:, None] + np.stack([0 * u, u, u + v, v]))
-            painted.append(np.repeat(colours[exposed], 4, axis=0))
+    for axis, sign in product(range(3), (1, -1)):
+        exposed = empty[tuple((voxels + 1 + sign * unit[axis]).T)]
+        u, v = (unit[(axis + 1) % 3], unit[(axis + 2) % 3])[::sign]
+        origin = voxels[exposed] + (unit[axis] if sign > 0 else 0)
+        corners.append(origin[:, None] + np.stack([0 * u, u, u + v, v]))
+        painted.append(np.repeat(colours[exposed], 4, axis=0))
     points = np.concatenate(corners).reshape(-1, 3) / RESOLUTION - 0.5
     first = 4 * np.arange(len(points) // 4, dtype=np.int32)[:, None]
     halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)

@@ -181,10 +181,7 @@ def _averaged(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _steps_down(depth: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return the pixels that have a much farther neighbour."""
-    step = np.zeros(depth.shape, dtype=bool)
-    padded = np.pad(depth, 1, constant_values=-np.inf)
-    rows, columns = depth.shape
-    for dy, dx in ((0, 1), (2, 1), (1, 0), (1, 2)):
-        beside = padded[dy : dy + rows, dx : dx + columns]
-        step |= beside < depth - _OUTLINE_STEP
-    return step
+    from scipy.ndimage import minimum_filter1d
+
+    beside = (minimum_filter1d(depth, 3, axis, mode="constant", cval=-np.inf) for axis in (0, 1))
+    return np.asarray(np.minimum(*beside) < depth - _OUTLINE_STEP)

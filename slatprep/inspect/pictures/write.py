@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError, amount
-from slatprep.inspect.check import AlignmentCheck, check_alignment
+from slatprep.inspect.check import FITNESS, AlignmentCheck, check_alignment
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import draw_alignment, error_picture, outlined
-from slatprep.inspect.pictures.scene import FARTHEST, Scene, scene_of, views
+from slatprep.inspect.pictures.scene import FARTHEST, scene_of, views
 from slatprep.records import Place
 from slatprep.storage.atomic import staged
 from slatprep.storage.files import file_name
@@ -52,32 +52,24 @@ def write_pictures(
     cannot be written, or a record cannot be read.
     """
     kind = target.suffix.lower()[1:]
-    alone = len(checks) == 1 and kind in canvas.FORMATS
-    shown = {check.asset_id: check for check in checks[:MOST]}
-    drawn: dict[str, tuple[Scene, str]] = {}
-    files = {
-        check.asset_id: target if alone else target / f"{file_name(check.asset_id)}.png"
-        for check in checks
-    }
+    if alone := len(checks) == 1 and kind in canvas.FORMATS:
+        files = {checks[0].asset_id: target}
+    else:
+        files = {one.asset_id: target / f"{file_name(one.asset_id)}.png" for one in checks}
     tasks = ((store.path, check, kind if alone else "png") for check in checks)
-    for done, (asset_id, picture, scene, title) in enumerate(run_unordered(_drawn, tasks, jobs), 1):
+    for done, (asset_id, picture) in enumerate(run_unordered(_drawn, tasks, jobs), 1):
         _write(files[asset_id], picture)
-        if asset_id in shown:
-            drawn[asset_id] = scene, title
         if progress is not None:
             progress(done, len(checks))
     if len(checks) < 2:
         return list(files.values()), None
-    scenes, titles = zip(*(drawn[asset_id] for asset_id in shown), strict=True)
-    _write(target / SHEET, draw_sheet(scenes, list(shown.values()), titles))
+    _write(target / SHEET, draw_sheet(store, checks[:MOST]))
     return list(files.values()), target / SHEET
 
 
 def sheet_of(store: Store, asset_ids: Sequence[str]) -> bytes:
     """Draw a contact sheet of up to `MOST` assets of a store."""
-    shown = [store.asset(asset_id) for asset_id in asset_ids[:MOST]]
-    checks = [check_alignment(store, asset.asset_id) for asset in shown]
-    return draw_sheet([scene_of(one) for one in shown], checks, [title_of(one) for one in shown])
+    return draw_sheet(store, [check_alignment(store, one) for one in asset_ids[:MOST]])
 
 
 def picture_of(asset: StoredAsset) -> Image:
@@ -88,52 +80,48 @@ def picture_of(asset: StoredAsset) -> Image:
     return PIL.Image.open(io.BytesIO(_drawn(asset.store.path, check, "png")[1]))
 
 
-def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes, Scene, str]:
-    """Return an asset's id, its picture, and what a contact sheet shows of it."""
+def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes]:
+    """Return an asset's id and its picture."""
     store = open_store(path)
     asset = store.asset(check.asset_id)
-    scene, title = scene_of(asset), title_of(asset)
-    alignment = StoredRecords(store).of(check.asset_id).alignment
+    alignment = StoredRecords(store).read(asset.index).alignment
+    how = "engine {engine}, {model}, starts {search}".format_map(asset.columns)
+    subtitle = f"{amount(len(asset.coords), 'SLAT voxel')}   {how}"
+    finer = 1 if kind == "png" else 2
     with canvas.styled():
-        finer = 1 if kind == "png" else 2
-        figure = draw_alignment(scene, check, title, subtitle_of(asset), alignment, finer)
-        return check.asset_id, canvas.in_format(figure, kind), scene, title
+        figure = draw_alignment(scene_of(asset), check, title_of(asset), subtitle, alignment, finer)
+        return check.asset_id, canvas.in_format(figure, kind)
 
 
-def draw_sheet(
-    scenes: Sequence[Scene], checks: Sequence[AlignmentCheck], titles: Sequence[str]
-) -> bytes:
-    """Draw at most `MOST` alignments, in this order, as one PNG."""
-    columns = min(_ACROSS, max(len(scenes), 2))
-    rows = -(-len(scenes) // columns)
+def draw_sheet(store: Store, checks: Sequence[AlignmentCheck]) -> bytes:
+    """Draw alignments, in this order, as one PNG."""
+    columns = min(_ACROSS, max(len(checks), 2))
+    rows = -(-len(checks) // columns)
     width = 2 * _MARGIN + columns * (_CELL_WIDTH + _GAP) - _GAP
     height = _HEAD + rows * _CELL_HEIGHT + _MARGIN
 
     with canvas.styled():
         figure = canvas.new_figure(width, height)
-        canvas.write(figure, _MARGIN, 46, f"{len(scenes)} alignments", weight="bold", size=12)
-        canvas.write(
-            figure, _MARGIN, 68, "left: PixieVerse voxels by class, SLAT outlined; "
-            f"right: error per voxel, pale 0 to dark {FARTHEST:g} voxels",
-            size=7, color=canvas.MUTED,
-        )  # fmt: skip
-        for number, (scene, check, title) in enumerate(zip(scenes, checks, titles, strict=True)):
+        canvas.write(figure, _MARGIN, 46, f"{len(checks)} alignments", weight="bold", size=12)
+        words = "left: PixieVerse voxels by class, SLAT outlined; right: error per voxel, pale 0"
+        canvas.note(figure, _MARGIN, 68, f"{words} to dark {FARTHEST:g} voxels")
+        for number, check in enumerate(checks):
             row, column = divmod(number, columns)
             x, y = _MARGIN + column * (_CELL_WIDTH + _GAP), _HEAD + row * _CELL_HEIGHT
+            asset = store.asset(check.asset_id)
+            scene, title = scene_of(asset), title_of(asset)
             view = views(scene, _THUMBNAIL)[0]
             images = *outlined(scene, view, scene.placed), error_picture(scene, view)
             for k, image in enumerate(images):
                 canvas.draw_image(figure, x + k * _THUMBNAIL, y, image)
-            colour = canvas.VERDICT_COLOURS[check.verdict]
-            line = y + _THUMBNAIL + 16
-            canvas.write(figure, x, line, canvas.cut(title, _TITLE), size=7.5, weight="bold")
-            right = {"size": 7.5, "weight": "bold", "color": colour, "ha": "right"}
+            line, bold = y + _THUMBNAIL + 16, {"size": 7.5, "weight": "bold"}
+            canvas.write(figure, x, line, canvas.cut(title, _TITLE), **bold)
+            right = {**bold, "color": canvas.VERDICT_COLOURS[check.verdict], "ha": "right"}
             canvas.write(figure, x + _CELL_WIDTH - _GAP, line, str(check.verdict), **right)
-            canvas.write(figure, x, line + 17, check.asset_id[:40], size=6.5, color=canvas.MUTED)
-            worse = min(check.figure("fitness").value, check.figure("fitness_backward").value)
-            sure = check.value("confidence")
+            canvas.note(figure, x, line + 17, check.asset_id[:40], 6.5)
+            worse, sure = min(map(check.value, FITNESS)), check.value("confidence")
             words = f"confidence {sure:.3f}   fitness {worse:.3f} (the lower of both ways)"
-            canvas.write(figure, x, line + 32, words, size=6.5, color=canvas.MUTED)
+            canvas.note(figure, x, line + 32, words, 6.5)
         return canvas.in_format(figure)
 
 
@@ -141,13 +129,6 @@ def title_of(asset: StoredAsset) -> str:
     """Return the title of an asset's picture: its category where it is known, and its id."""
     category = str(asset.columns["category"]).replace("_", " ")
     return f"{category}: {asset.asset_id}" if category else asset.asset_id
-
-
-def subtitle_of(asset: StoredAsset) -> str:
-    """Return an asset's number of voxels and how it was aligned, in one line."""
-    columns = asset.columns
-    how = f"engine {columns['engine']}, {columns['model']}, starts {columns['search']}"
-    return f"{amount(len(asset.coords), 'SLAT voxel')}   {how}"
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -11,7 +11,7 @@ import hashlib
 import html
 import json
 from base64 import b64encode
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from operator import attrgetter
@@ -21,10 +21,9 @@ from typing import Any, TextIO
 import numpy as np
 
 from slatprep.errors import StoreError
-from slatprep.inspect.report.content import page_content
-from slatprep.inspect.report.drawn import BINS, COARSE, FULL, PER_SHEET, Drawn, draw_asset, sheet
-from slatprep.inspect.report.outcomes import gather_outcomes
-from slatprep.inspect.tallies import no_tally
+from slatprep.inspect.report.content import gather_outcomes, page_content
+from slatprep.inspect.report.drawn import COARSE, FULL, PER_SHEET, Drawn, draw_asset, sheet
+from slatprep.inspect.tallies import Tally
 from slatprep.inspect.verify import WORDS
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Place, Verdict
@@ -119,30 +118,22 @@ def write_report(
         names = {store.ids[row] for row in listed}
         outcomes = gather_outcomes(manifests, store, names, ASSETS_LISTED)
     drawn: list[Drawn] = []
-    nothing = no_tally(store.normalization, BINS, contents=store.contents)
+    tallies: dict[str, Tally] = {}
     categories = list(map(str, store.column("category")))
-    tallies = {categories[row]: nothing for row in chosen}
     source = SourceStore(store.path)
     for one, counts in run_unordered(draw_asset, ((source, row) for row in chosen), jobs):
         drawn.append(one)
-        tallies[categories[one.index]] += counts
+        category = categories[one.index]
+        tallies[category] = tallies[category] + counts if category in tallies else counts
         if progress:
             progress(len(drawn), len(chosen))
     drawn.sort(key=attrgetter("index"))
     full = sum(len(one.voxels[FULL]) for one in drawn)
     side = FULL if full <= VOXEL_BYTES else COARSE
-    agreement = {one.index: (one.votes, one.spreads) for one in drawn if one.spreads}
-    content = page_content(store, outcomes, tallies, listed, chosen, side, agreement)
-    sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
+    content = page_content(store, outcomes, tallies, listed, drawn, side)
     with writing(str(out), Path(out).parent), staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
-            _write_page(
-                file,
-                str(content["title"]),
-                content,
-                sheets=(sheet([one.thumbnail for one in own]) for own in sheets),
-                packs=([b64encode(one.voxels[side]).decode() for one in own] for own in sheets),
-            )
+            _write_page(file, content, drawn, side)
         size = temporary.stat().st_size
     total, in_table = content["all"]["assets"], len(content["assets"]["id"])
     return ReportSummary(Path(out), size, total, in_table, len(chosen), side)
@@ -171,17 +162,14 @@ def _chosen(store: Store) -> list[int]:
 
 
 def _write_page(
-    file: TextIO,
-    title: str,
-    content: Mapping[str, Any],
-    sheets: Iterable[bytes],
-    packs: Iterable[list[str]],
+    file: TextIO, content: Mapping[str, Any], drawn: Sequence[Drawn], side: int
 ) -> None:
     """Write a page to a UTF-8 file with plain line feeds.
 
-    `content` is from `slatprep.inspect.report.content.page_content`. `sheets` are PNG files of
-    thumbnails; `packs` has for each of them the voxels of its assets in base64.
+    `content` is from `slatprep.inspect.report.content.page_content`. Assets `drawn` are shown by
+    `side` voxels per edge.
     """
+    sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     style = _asset("style.css")
     script = "\n".join(_asset("js", f"{name}.js") for name in SCRIPTS)
     library = _asset("vendor", "three.min.js")
@@ -190,16 +178,19 @@ def _write_page(
         f"style-src {_hash(style)}; script-src {_hash(script)} {_hash(library)}"
     )
     head, body = _asset("page.html").split("{{content}}")
-    for name, text in (("style", style), ("policy", policy), ("title", html.escape(title))):
+    title = html.escape(str(content["title"]))
+    for name, text in (("style", style), ("policy", policy), ("title", title)):
         head = head.replace(f"{{{{{name}}}}}", text)
     file.write(head)
     # The data come first, so that the table works while the browser still reads the pictures.
     _block(file, "content", "application/json", _json(content))
     file.write(f"<script>{script}</script>\n")
     _block(file, "library", "text/plain", library)
-    for number, png in enumerate(sheets):
+    for number, own in enumerate(sheets):
+        png = sheet([one.thumbnail for one in own])
         _block(file, f"sheet-{number}", "text/plain", b64encode(png).decode("ascii"))
-    for number, pack in enumerate(packs):
+    for number, own in enumerate(sheets):
+        pack = (b64encode(one.voxels[side]).decode() for one in own)
         _block(file, f"pack-{number}", "text/plain", "\n".join(pack))
     file.write(body)
 
@@ -211,9 +202,7 @@ def _json(content: Mapping[str, Any]) -> str:
 
 
 def _block(file: TextIO, name: str, kind: str, text: str) -> None:
-    """Write a block of data, which browsers do not execute."""
-    if "</script" in text.lower() or "<!--" in text:
-        raise ValueError(f"the block {name} would end before its end")
+    """Write a block of data, which browsers do not execute; no text may hold ``</script``."""
     file.write(f'<script type="{kind}" id="{name}">{text}</script>\n')
 
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slatprep.align.starts import distinct_starts
+from slatprep.errors import StoreError
 from slatprep.geometry.frames import split_transform
 from slatprep.inspect.check import LIMITS
 from slatprep.inspect.pictures.canvas import DISTANCE_COLOURS
-from slatprep.inspect.report.drawn import BINS, COLUMNS, LEVELS, PER_SHEET, VIEWS
-from slatprep.inspect.report.outcomes import DIGITS, Outcomes, kinds_of, rounded
+from slatprep.inspect.report.drawn import BINS, COLUMNS, LEVELS, PER_SHEET, VIEWS, Drawn
 from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.pipeline.decoys import measured_errors, told_of
-from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR
+from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Place, Status
 from slatprep.store.reader import Store
+from slatprep.store.record import AssetRecord
+from slatprep.store.records import StoredRecords, build_in
 
 # Matplotlib's viridis (CC0) at even steps: its lightness rises with the value, so that
 # colour-blind readers can order the colours too.
@@ -34,8 +39,117 @@ _FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "i
 _UNTOLD: Mapping[str, Any] = {"ties": [], "reasons": []}
 """What the table says of an asset without the records of its build."""
 
-Agreement = Mapping[int, tuple[float, tuple[float, ...]]]
-"""Mean votes and mean spreads of rows with merged labels."""
+MOST_TIES = 8
+"""Most tied placements of an asset on the page."""
+
+DIGITS = 5
+"""Decimal places of numbers on the page."""
+
+# Not "failed", which is a verdict on an alignment: these were not aligned at all.
+_ABSENT = {Status.FAILED: "not built", Status.SKIPPED: "skipped"}
+
+_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+Columns = dict[str, Any]
+"""What the table on the page says of one asset, by the names of its columns."""
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """The outcomes of a build: each asset on the page, and how many are not in the store.
+
+    Attributes
+    ----------
+    created : str
+        Day of the build.
+    stored : dict of str to Columns
+        By id, what records say of the assets of the store that the page lists.
+    absent : list of Columns
+        Assets that are not in the store, sorted by id.
+    states : Counter
+        All of those, by state.
+    """
+
+    created: str
+    stored: dict[str, Columns]
+    absent: list[Columns]
+    states: Counter[str]
+
+
+def gather_outcomes(
+    manifests: Place, store: Store, listed: Collection[str], most_absent: int
+) -> Outcomes:
+    """Gather the outcomes of a build from its records.
+
+    It keeps the assets `listed` and at most `most_absent` that are not in the store. StoreError if
+    the records cannot be read, belong to another build, or lack an asset of the store.
+    """
+    build = build_in(manifests)
+    if build.id != store.about.manifest:
+        raise StoreError(
+            f"{manifests} holds the records of build {build.id[:12]!r}, the store was written by "
+            f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests"
+        )
+    records = (record for record in StoredRecords(store) if record.asset_id in listed)
+    failed = sorted(build.failed[:most_absent], key=lambda one: one.asset_id)
+    states = {state: build.statuses.get(str(status), 0) for status, state in _ABSENT.items()}
+    return Outcomes(
+        created=f"{build.created:%Y-%m-%d}",
+        stored={record.asset_id: _columns_of(record) for record in records},
+        absent=[
+            {
+                "id": one.asset_id,
+                "category": one.category,
+                "state": _ABSENT[one.status],
+                "reasons": [one.reason],
+            }
+            for one in failed
+        ],
+        states=+Counter(states),
+    )
+
+
+def _columns_of(record: AssetRecord) -> Columns:
+    placements, merged = record.alignment.placements, record.merged
+    return {
+        "reasons": list(record.judgement.reasons),
+        # Distinct placements that fit about as well as the best, and the first of their transforms.
+        "tied": len(placements),
+        "ties": [
+            [round(number, 6) for number in one.transform[:3].ravel().tolist()]
+            for one in placements[:MOST_TIES]
+        ],
+        "displacement": rounded(max((one.displacement for one in placements), default=None)),
+        "annotations": [sum(not one.left_out for one in merged), len(merged)] if merged else None,
+    }
+
+
+def rounded(value: float | None) -> float | None:
+    """Return a number with as many digits as the page has; None where it is not finite."""
+    return None if value is None or not np.isfinite(value) else round(value, DIGITS)
+
+
+def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
+    """Return each reason without its file, and without numbers but those that all of a kind share.
+
+    >>> list(kinds_of(["only 7% lie within 1 voxel", "only 8.5% lie within 1 voxel"]).values())
+    ['only N% lie within 1 voxel', 'only N% lie within 1 voxel']
+    >>> list(kinds_of(["a/b.npz: holds 3 voxels twice; expected distinct coordinates"]).values())
+    ['holds 3 voxels twice']
+    """
+    parts = {}
+    common: dict[tuple[str, ...], list[str]] = {}
+    for reason in reasons:
+        fault = re.sub(r"^\S*[/\\.]\S*: ", "", reason.partition("; expected")[0])
+        words, numbers = tuple(_NUMBER.split(fault)), _NUMBER.findall(fault)
+        known = common.setdefault(words, numbers)
+        common[words] = [a if a == b else "N" for a, b in zip(known, numbers, strict=True)]
+        parts[reason] = words
+    return {
+        reason: "".join(chain.from_iterable(zip(words, [*common[words], ""], strict=True)))
+        for reason, words in parts.items()
+    }
 
 
 def page_content(
@@ -43,16 +157,15 @@ def page_content(
     outcomes: Outcomes | None,
     tallies: Mapping[str, Tally],
     listed: Sequence[int],
-    chosen: Sequence[int],
+    drawn: Sequence[Drawn],
     side: int,
-    agreement: Agreement,
 ) -> dict[str, Any]:
     """Return the content of a page, JSON-ready; NaN and unknown values are None.
 
     `outcomes` come from the records, if any, and `tallies` count voxels by category. Rows `listed`
-    are in the table, rows `chosen` also have a thumbnail and a 3D view with `side` voxels per edge;
-    both ascend. `agreement` has mean votes and mean spreads of merged labels by row. Columns of the
-    table are lists over assets, those of the store first; ``all`` counts also assets outside it.
+    are in the table, those `drawn` also have a thumbnail and a 3D view with `side` voxels per edge;
+    both ascend. Columns of the table are lists over assets, those of the store first; ``all``
+    counts also assets outside it.
     """
     build, labels = store.about.build, store.contents.labels
     states = Counter(map(str, store.column("verdict")))
@@ -87,7 +200,7 @@ def page_content(
         },
         "detail": {
             "side": side,
-            "assets": len(chosen),
+            "assets": len(drawn),
             "levels": LEVELS,
             "per_sheet": PER_SHEET,
             "columns": COLUMNS,
@@ -97,7 +210,7 @@ def page_content(
         "turns": quarter_turns(),
         "properties": _properties(store, outcomes, tallies),
         "balance": _balance(store, tallies),
-        "assets": _table(store, outcomes, listed, chosen, agreement),
+        "assets": _table(store, outcomes, listed, drawn),
         "all": {
             "stored": len(store),
             "assets": sum(states.values()),
@@ -162,11 +275,7 @@ def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]
 
 
 def _table(
-    store: Store,
-    outcomes: Outcomes | None,
-    listed: Sequence[int],
-    chosen: Sequence[int],
-    agreement: Agreement,
+    store: Store, outcomes: Outcomes | None, listed: Sequence[int], drawn: Sequence[Drawn]
 ) -> dict[str, list[Any]]:
     """Return the columns of the table of assets."""
     rows = np.array(listed, dtype=np.intp)
@@ -175,7 +284,8 @@ def _table(
     absent = outcomes.absent if outcomes else []
     transforms = store.column("transform")[rows]
     nearest = [nearest_quarter_turn(transform) for transform in transforms]
-    pictures = {index: number for number, index in enumerate(chosen)}
+    pictures = {one.index: number for number, one in enumerate(drawn)}
+    merged = {one.index: one for one in drawn if one.spreads}
     of_stored: dict[str, Iterable[Any]] = {
         "id": ids,
         "category": map(str, store.column("category")[rows]),
@@ -194,10 +304,9 @@ def _table(
         },
         "picture": map(pictures.get, listed),
         "annotations": (own.get("annotations") for own in told),
-        "votes": (rounded(agreement.get(row, (None, ()))[0]) for row in listed),
+        "votes": (rounded(merged[row].votes) if row in merged else None for row in listed),
         "spreads": (
-            [rounded(one) for one in agreement[row][1]] if row in agreement else None
-            for row in listed
+            list(map(rounded, merged[row].spreads)) if row in merged else None for row in listed
         ),
         **{name: map(rounded, store.column(name)[rows].tolist()) for name in _FIGURES},
     }
@@ -226,12 +335,10 @@ def quarter_turns() -> tuple[str, ...]:
     >>> quarter_turns()[0]
     'x→+x y→+y z→+z'
     """
-    return tuple(_in_words(start.rotation) for start in distinct_starts())
-
-
-def _in_words(rotation: NDArray[np.float64]) -> str:
-    words = []
-    for name, column in zip("xyz", rotation.T, strict=True):
-        axis = int(np.argmax(np.abs(column)))
-        words.append(f"{name}→{'+' if column[axis] > 0 else '−'}{'xyz'[axis]}")  # noqa: RUF001
-    return " ".join(words)
+    turns = []
+    for start in distinct_starts():
+        axes = np.abs(start.rotation).argmax(axis=0)
+        signs = ("+" if column.sum() > 0 else "\u2212" for column in start.rotation.T)
+        ends = zip("xyz", signs, axes, strict=True)
+        turns.append(" ".join(f"{name}→{sign}{'xyz'[axis]}" for name, sign, axis in ends))
+    return tuple(turns)

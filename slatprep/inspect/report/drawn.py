@@ -67,8 +67,6 @@ _SMOOTHING = 5
 LEVELS = 64
 """Steps of a quantised property or distance, finer than a colour scale can show."""
 
-NOT_VALID = 255
-
 FULL, COARSE = RESOLUTION, RESOLUTION // 2
 """Voxels per edge of the two levels of detail."""
 
@@ -95,11 +93,8 @@ def draw_asset(source: SourceStore, row: int) -> tuple[Drawn, Tally]:
     """Draw an asset of a store and tally its voxels, in a worker."""
     store = source.store
     asset = store.asset(row)
-    way, farthest = (
-        source.records.place_map(asset),
-        store.about.build.parameters.sample.max_distance,
-    )
-    voxels = {side: encode_asset(asset, way, farthest, side) for side in (FULL, COARSE)}
+    way = source.records.place_map(asset)
+    voxels = {side: encode_asset(asset, way, side) for side in (FULL, COARSE)}
     field = asset.grid_material, asset.grid_properties
     slat = asset.material, asset.properties
     counts = tally(field, slat, store.normalization, BINS, contents=store.contents)
@@ -190,20 +185,21 @@ def _brightness(depth: NDArray[np.intp], hit: NDArray[np.bool_]) -> NDArray[np.f
     return np.clip(lambert, 0.0, 1.0)
 
 
-def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: int) -> bytes:
+def encode_asset(asset: StoredAsset, way: PlaceMap, side: int) -> bytes:
     """Return an asset's voxels for the 3D view, in the form that this module describes.
 
-    `way` maps between its frames. Distances [voxel] are scaled up to `max_distance`. `side` is
-    `FULL`, or `COARSE` for voxels of 2 x 2 x 2.
+    `way` maps between its frames. `side` is `FULL`, or `COARSE` for voxels of 2 x 2 x 2.
     """
     cells, row = asset.cells
     first, occupied = _cells(cells, side)
     first = row[first]
-    grid, material = _boundary_of(asset.grid_material, asset.store.contents.background)
+    occupancy = asset.grid_material != asset.store.contents.background
+    surface = boundary(filled(occupancy)) & occupancy  # the outer one
+    grid, material = np.argwhere(surface), asset.grid_material[surface]
     chosen, grid_occupied = _cells(grid, side)
-    scalars = np.column_stack(
-        [(asset.properties[first] + 1.0) / 2.0, asset.distance[first] / max_distance]
-    )
+    farthest = asset.store.about.build.parameters.sample.max_distance
+    distance = asset.distance[first] / farthest
+    scalars = np.column_stack([(asset.properties[first] + 1.0) / 2.0, distance])
     scalars[~asset.valid[first], :3] = np.nan
     parts = [
         occupied,
@@ -221,16 +217,6 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, max_distance: float, side: i
     return deflate.compress(b"".join(parts)) + deflate.flush()
 
 
-def _boundary_of(
-    grid_material: NDArray[np.uint8], background: int
-) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
-    """Return the outer surface (K, 3) of a field and the class (K,) of its voxels."""
-    occupancy = grid_material != background
-    surface = boundary(filled(occupancy)) & occupancy
-    material = grid_material[surface]
-    return np.argwhere(surface), np.where(material == UNANNOTATED, NOT_VALID, material)
-
-
 def _cells(voxels: NDArray[np.integer], side: int) -> tuple[NDArray[np.intp], bytes]:
     """Return the first voxel of each occupied cell, and the bits of all cells, in C order."""
     cells = voxels.astype(np.intp) // (RESOLUTION // side)
@@ -241,7 +227,7 @@ def _cells(voxels: NDArray[np.integer], side: int) -> tuple[NDArray[np.intp], by
 
 
 def _quantised(share: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return shares 0..1 in `LEVELS` steps; NaN as `NOT_VALID`."""
+    """Return shares 0..1 in `LEVELS` steps; NaN as `UNANNOTATED`."""
     known = np.isfinite(share)
     steps = np.round(np.clip(np.where(known, share, 0.0), 0.0, 1.0) * (LEVELS - 1))
-    return np.where(known, steps, NOT_VALID).astype(np.uint8)
+    return np.where(known, steps, UNANNOTATED).astype(np.uint8)

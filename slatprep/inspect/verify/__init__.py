@@ -7,6 +7,7 @@ asset's values and record, and finally the source files that the records name.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -42,6 +43,22 @@ WORDS = {
     words.__name__.lower(): tuple(map(str, words)) for words in (Engine, Model, Search, Verdict)
 }
 """Allowed words by column."""
+
+_LETTERS = "letters, digits, '.', '_' and '-'"
+_TEXTS = {
+    "id": (ASSET_ID, _LETTERS),
+    "object_id": (NAME, _LETTERS),
+    "view": (re.compile(f"({NAME.pattern})?"), _LETTERS),  # An object with one SLAT has no view.
+    **{name: (re.compile("|".join(words)), f"one of {words}") for name, words in WORDS.items()},
+}
+"""What texts of a column may be, and that in words."""
+
+_NUMBERS = {
+    **dict.fromkeys(SHARES, 1.0),
+    **dict.fromkeys(DISTANCES, np.inf),
+    "unphysical": RESOLUTION**3,
+}
+"""The largest number of a column; the smallest is 0."""
 
 # R of a similarity satisfies R^T R = s^2 I; rounding leaves this much.
 _TOLERANCE = 1e-6
@@ -192,23 +209,18 @@ def index_findings(store: Store) -> Iterator[Finding]:
             what = "occurs twice" if after in known else f"comes after {before!r}"
             yield Finding("asset/id", after, what, "ids ascending in each segment, each once")
         known.add(after)
-    for name, allowed in (("id", ASSET_ID), ("object_id", NAME), ("view", NAME)):
-        for asset_id, value in zip(ids, store.column(name), strict=True):
-            # An object with one SLAT has no view.
-            if not (allowed.fullmatch(value) or (name == "view" and value == "")):
-                yield Finding(
-                    f"asset/{name}", asset_id, f"is {value!r}", "letters, digits, '.', '_' and '-'"
-                )
     yield from _offset_findings(store)
-    for name in SHARES:
-        yield from _outside(store, name, 0.0, 1.0)
-    for name in DISTANCES:
-        yield from _outside(store, name, 0.0, np.inf, nan=True)
-    yield from _outside(store, "unphysical", 0, RESOLUTION**3)
-    for name, words in WORDS.items():
-        for asset_id, word in zip(ids, store.column(name), strict=True):
-            if str(word) not in words:
-                yield Finding(f"asset/{name}", asset_id, repr(word), f"one of {words}")
+    for name, (allowed, expected) in _TEXTS.items():
+        for asset_id, text in zip(ids, store.column(name), strict=True):
+            if not allowed.fullmatch(text):
+                yield Finding(f"asset/{name}", asset_id, f"is {text!r}", expected)
+    for name, most in _NUMBERS.items():
+        values = store.column(name)
+        fine = (values >= 0) & (values <= most)
+        if name in DISTANCES:
+            fine |= np.isnan(values)
+        for wrong in np.flatnonzero(~fine):
+            yield Finding(f"asset/{name}", ids[wrong], f"is {values[wrong]}", f"0 to {most:g}")
     yield from _transform_findings(store)
 
 
@@ -223,27 +235,20 @@ def _offset_findings(store: Store) -> Iterator[Finding]:
         yield Finding(where, store.ids[row], f"{sizes[row]} rows", f"1 to {MAX_VOXELS} rows")
 
 
-def _outside(store: Store, name: str, lo: float, hi: float, nan: bool = False) -> Iterator[Finding]:
-    values = store.column(name)
-    fine = (values >= lo) & (values <= hi)
-    if nan:
-        fine |= np.isnan(values)
-    for row in np.flatnonzero(~fine):
-        yield Finding(f"asset/{name}", store.ids[row], f"is {values[row]}", f"{lo:g} to {hi:g}")
-
-
 def _transform_findings(store: Store) -> Iterator[Finding]:
     for asset_id, model, transform in zip(
         store.ids, store.column("model"), store.column("transform"), strict=True
     ):
         linear = transform[:3, :3]
-        similar = np.isfinite(transform).all() and (transform[3] == (0, 0, 0, 1)).all()
-        determinant = float(np.linalg.det(linear)) if similar else 0.0
-        square = abs(determinant) ** (2 / 3)
         kind = "rigid" if model == "rigid" else "similarity"
-        unit = abs(determinant - 1) <= _TOLERANCE if model == "rigid" else True
-        rest = np.abs(linear.T @ linear - square * np.eye(3)).max() if similar else np.inf
-        if determinant <= 0 or not unit or rest > _TOLERANCE * max(square, 1.0):
+        fine = np.isfinite(transform).all() and (transform[3] == (0, 0, 0, 1)).all()
+        if fine:
+            determinant = float(np.linalg.det(linear))
+            square = abs(determinant) ** (2 / 3)
+            rest = np.abs(linear.T @ linear - square * np.eye(3)).max()
+            fine = determinant > 0 and rest <= _TOLERANCE * max(square, 1.0)
+            fine &= kind != "rigid" or abs(determinant - 1) <= _TOLERANCE
+        if not fine:
             yield Finding(
                 "asset/transform",
                 asset_id,

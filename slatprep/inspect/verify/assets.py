@@ -38,7 +38,7 @@ from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import Finding
 from slatprep.store.layout import RECORD_ARRAY
-from slatprep.store.reader import Store, StoredAsset
+from slatprep.store.reader import StoredAsset
 from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import RecordError, columns_of, digest_of
 from slatprep.store.shard_reader import DamagedFileError
@@ -55,94 +55,84 @@ def asset_findings(
 
     Sources are compared if `roots` is given.
     """
-    store, asset_id = source.store, source.store.ids[row]
+    asset_id, findings, compared = source.store.ids[row], list[Finding](), 0
+    where, expected = "asset", "an asset that can be read"
     try:
-        asset = store.asset(row)
-        findings = list(value_findings(asset)) or list(lookup_findings(asset))
-    except DamagedFileError as error:
-        return [Finding(error.file, asset_id, error.fault, error.expected)], 0
-    except StoreError as error:
-        return [Finding("asset", asset_id, str(error), "an asset that can be read")], 0
-    sound = not findings
-    try:
+        asset = source.store.asset(row)
+        findings += list(value_findings(asset)) or lookup_findings(asset)
+        sound = not findings
+        where, expected = RECORD_ARRAY, "a record for each row"
         record = source.records.read(row)
-    except RecordError as error:
-        return [*findings, *fault_findings(RECORD_ARRAY, asset_id, error)], 0
-    except StoreError as error:
-        return [*findings, Finding(RECORD_ARRAY, asset_id, f"no record ({error})", "one a row")], 0
-    try:
         findings += record_findings(asset, record, source.text(row))
+        if sound:  # From invalid values no confidence can be computed.
+            findings += confidence_findings(asset, record)
+        if roots is not None:
+            changed, compared = list(source_findings(record, roots, source)), len(record.sources)
+            findings += changed
+            if record.merged and sound and not changed:
+                findings += merged_findings(asset, record, roots)
     except DamagedFileError as error:
-        return [*findings, Finding(error.file, asset_id, error.fault, error.expected)], 0
-    if sound:  # From invalid values no confidence can be computed.
-        findings += confidence_findings(asset, record)
-    if roots is None:
-        return findings, 0
-    changed = list(source_findings(record, roots, source))
-    findings += changed
-    if record.merged and sound and not changed:
-        findings += merged_findings(asset, record, roots)
-    return findings, len(record.sources)
+        findings.append(Finding(error.file, asset_id, error.fault, error.expected))
+    except RecordError as error:
+        findings += fault_findings(RECORD_ARRAY, asset_id, error)
+    except StoreError as error:
+        findings.append(Finding(where, asset_id, str(error), expected))
+    return findings, compared
 
 
 def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     """Yield findings on values that the contract does not allow."""
-    coords, valid, material = asset.coords, asset.valid, asset.material
-    contents = asset.store.contents
-    classes = (*range(contents.n_labels), contents.background, UNANNOTATED)
-    labelled = material < contents.n_labels
-    checks = {
-        "voxel/feats": (np.isfinite(asset.feats).all(), "NaN or infinite", "finite latents"),
-        "voxel/material": (
-            (labelled == valid).all() and (material[~valid] == UNANNOTATED).all(),
-            "a class that does not go with valid",
-            f"0 to {contents.n_labels - 1} where valid, 255 elsewhere",
-        ),
-        "voxel/properties": (
-            _normalised(asset.properties.T, valid),
-            "a property that does not go with valid",
-            "-1 to 1 where valid, NaN elsewhere",
-        ),
-        "voxel/distance": (
-            (asset.distance >= 0).all(),
-            "negative or NaN",
-            "a distance of 0 or more",
-        ),
-        "voxel/place": (np.isfinite(asset.place).all(), "NaN or infinite", "finite points"),
-        "voxel/confidence": (
-            ((asset.confidence >= 0) & (asset.confidence <= valid)).all(),
-            "no probability, or one where there is no class",
-            "0 to 1 where valid, 0 elsewhere",
-        ),
-        "voxel/spread": (
-            _is_spread(asset),
-            "negative, or there where fewer than two annotations are",
-            "0 or more for all properties or NaN for all",
-        ),
-        "voxel/votes": (
-            not asset.merged or (((asset.votes > 0) == valid).all() and (asset.votes <= 1).all()),
-            "no share, or one where there is no class",
-            "above 0 to 1 where valid, 0 elsewhere",
-        ),
-        "grid/material": (
-            np.isin(np.arange(256), classes)[asset.grid_material].all(),
-            "an unknown class",
-            f"0 to {contents.n_labels - 1}, {contents.background} or 255",
-        ),
-        "grid/properties": (
-            _normalised(asset.grid_properties, asset.grid_material < contents.n_labels),
-            "a property that does not go with grid/material",
-            "-1 to 1 where annotated, NaN elsewhere",
-        ),
+    valid, material, grid, votes = asset.valid, asset.material, asset.grid_material, asset.votes
+    contents, likely = asset.store.contents, asset.confidence
+    classes, empty = contents.n_labels, contents.background
+    known = np.isin(np.arange(256), (*range(classes), empty, UNANNOTATED))
+    sound = {
+        "voxel/coords": (np.diff(np.sort(flat_index(asset.coords, 256))) > 0).all(),
+        "voxel/feats": np.isfinite(asset.feats).all(),
+        "voxel/material": (np.where(valid, material < classes, material == UNANNOTATED)).all(),
+        "voxel/properties": _normalised(asset.properties.T, valid),
+        "voxel/distance": (asset.distance >= 0).all(),
+        "voxel/place": np.isfinite(asset.place).all(),
+        "voxel/confidence": ((likely >= 0) & (likely <= valid)).all(),
+        "voxel/spread": _is_spread(asset),
+        "voxel/votes": not asset.merged or (((votes > 0) == valid) & (votes <= 1)).all(),
+        "grid/material": known[grid].all(),
+        "grid/properties": _normalised(asset.grid_properties, grid < classes),
     }
-    for where, (fine, what, expected) in checks.items():
+    for where, fine in sound.items():
         if not fine:
+            what, expected = _FAULTS[where]
+            expected = expected.format(last=classes - 1, empty=empty)
             yield Finding(where, asset.asset_id, what, expected)
-    cells = flat_index(coords, 256)
-    if not (cells[1:] > cells[:-1]).all():  # Otherwise they are in order, as usual, and unique.
-        cells.sort()
-    if (cells[1:] == cells[:-1]).any():
-        yield Finding("voxel/coords", asset.asset_id, "a coordinate occurs twice", "each once")
+
+
+_FAULTS = {
+    "voxel/coords": ("a coordinate occurs twice", "each once"),
+    "voxel/feats": ("NaN or infinite", "finite latents"),
+    "voxel/material": (
+        "a class that does not go with valid", "0 to {last} where valid, 255 elsewhere"
+    ),
+    "voxel/properties": (
+        "a property that does not go with valid", "-1 to 1 where valid, NaN elsewhere"
+    ),
+    "voxel/distance": ("negative or NaN", "a distance of 0 or more"),
+    "voxel/place": ("NaN or infinite", "finite points"),
+    "voxel/confidence": (
+        "no probability, or one where there is no class", "0 to 1 where valid, 0 elsewhere"
+    ),
+    "voxel/spread": (
+        "negative, or there where fewer than two annotations are",
+        "0 or more for all properties or NaN for all",
+    ),
+    "voxel/votes": (
+        "no share, or one where there is no class", "above 0 to 1 where valid, 0 elsewhere"
+    ),
+    "grid/material": ("an unknown class", "0 to {last}, {empty} or 255"),
+    "grid/properties": (
+        "a property that does not go with grid/material", "-1 to 1 where annotated, NaN elsewhere"
+    ),
+}  # fmt: skip
+"""What is wrong with an array that is not sound, and what is expected."""
 
 
 def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
@@ -153,12 +143,17 @@ def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
         yield Finding("asset", asset.asset_id, f"cannot be sampled ({error})", "sound parameters")
         return
     for where, difference in differences.items():
-        # Not `difference > TOLERANCES[where]`, which is false for NaN.
-        wrong = np.count_nonzero(~(difference <= TOLERANCES[where]))
-        if wrong:
-            what = f"{wrong} of {len(difference)} voxels differ"
-            expected = "what the grid, the places and the parameters give"
-            yield Finding(where, asset.asset_id, what, expected)
+        expected = "what the grid, the places and the parameters give"
+        yield from _voxel_findings(asset, where, difference <= TOLERANCES[where], expected)
+
+
+def _voxel_findings(
+    asset: StoredAsset, where: str, fine: NDArray[np.bool_], expected: str
+) -> Iterator[Finding]:
+    """Yield a finding unless all values (N, ...) of the voxels are fine; comparisons refuse NaN."""
+    wrong = np.count_nonzero(~fine.reshape(len(fine), -1).all(axis=1))
+    if wrong:
+        yield Finding(where, asset.asset_id, f"{wrong} of {len(fine)} voxels differ", expected)
 
 
 def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Finding]:
@@ -168,15 +163,13 @@ def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Findin
 
 def record_findings(asset: StoredAsset, record: AssetRecord, text: bytes) -> Iterator[Finding]:
     """Yield findings where an asset's record disagrees with its row or its stored places."""
-    store = asset.store
-    if digest_of(text) != bytes(store.cached_column("record_sha256")[asset.index]):
+    if digest_of(text) != bytes(asset.store.cached_column("record_sha256")[asset.index]):
         what = "is not what asset/record_sha256 is of"
         yield Finding(RECORD_ARRAY, asset.asset_id, what, "the record of the build")
-    for name, said, held in _claims(asset, record, store):
+    for name, said, held in _claims(asset, record):
         if not _equal(said, held):
-            yield Finding(
-                RECORD_ARRAY, asset.asset_id, f"{name} is {said!r}", f"{held!r}, as the store has"
-            )
+            what, expected = f"{name} is {said!r}", f"{held!r}, as the store has"
+            yield Finding(RECORD_ARRAY, asset.asset_id, what, expected)
     if bool(record.merged) != asset.merged:
         what = f"merges {len(record.merged)} annotations"
         expected = "several, as voxel/votes says" if asset.merged else "none, as voxel/votes says"
@@ -188,9 +181,7 @@ def record_findings(asset: StoredAsset, record: AssetRecord, text: bytes) -> Ite
         yield Finding(RECORD_ARRAY, asset.asset_id, what, "one where it is affine or deformable")
     places = map_of(alignment).to_pixieverse(asset.latents.centres)
     fine = np.abs(places - asset.place) <= PLACE_TOLERANCE
-    if not fine.all():
-        what = f"{np.count_nonzero(~fine.all(axis=1))} of {len(places)} voxels differ"
-        yield Finding("voxel/place", asset.asset_id, what, "where the map in the record leads")
+    yield from _voxel_findings(asset, "voxel/place", fine, "where the map in the record leads")
 
 
 def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Finding]:
@@ -207,13 +198,11 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
         return  # It may have come from other labels than the rounded values have.
     confidence = record.judgement.confidence
     likely = voxel_confidence(field, asset.latents, record.alignment, annotation, confidence)
-    wrong = np.count_nonzero(~(np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE))
-    if wrong:
-        what = f"{wrong} of {len(likely)} voxels differ"
-        expected = "what the grid, the places and the record give"
-        if record.code != code_fingerprint():
-            expected += " by today's code; another made the store, and building it again helps"
-        yield Finding("voxel/confidence", asset.asset_id, what, expected)
+    fine = np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE
+    expected = "what the grid, the places and the record give"
+    if record.code != code_fingerprint():
+        expected += " by today's code; another made the store, and building it again helps"
+    yield from _voxel_findings(asset, "voxel/confidence", fine, expected)
 
 
 def source_findings(
@@ -221,12 +210,11 @@ def source_findings(
 ) -> Iterator[Finding]:
     """Yield findings on sources that are missing or differ from the record."""
     for source in record.sources:
-        try:
-            own = (roots, *roots.also)[source.source]
-        except IndexError:
+        if source.source > len(roots.also):
             what = f"{source.path} is of [[also]] {source.source}, whose root is not known"
             yield Finding("sources", record.asset_id, what, "its root, by --also")
             continue
+        own = (roots, *roots.also)[source.source]
         root = roots.slat if source.role in LATENT_ROLES else own.pixieverse
         path = root / source.path
         expected = f"SHA-256 {source.sha256}"
@@ -238,17 +226,15 @@ def source_findings(
                 file, _ = storage_of(root).locate(path)
                 size = storage_of(file).size()
                 digest = _digest(file, store) if size == source.size else ""
+            what = "" if digest == source.sha256 else "its bytes changed"
             if size != source.size:
                 what = f"has {size} of {source.size} bytes"
-            elif digest != source.sha256:
-                what = "its bytes changed"
-            else:
-                continue
         except InputError as error:
             what = error.fault
         except OSError as error:
             what = f"cannot be read ({error.strerror})"
-        yield Finding(str(path), record.asset_id, what, expected)
+        if what:
+            yield Finding(str(path), record.asset_id, what, expected)
 
 
 def merged_findings(
@@ -281,10 +267,7 @@ def merged_findings(
         limit = TOLERANCES.get(f"voxel/{name}", CONFIDENCE_TOLERANCE)
         held, given = getattr(asset, name), np.asarray(now[name], dtype=np.float64)
         same = np.isclose(held, given, rtol=0.0, atol=limit, equal_nan=True)
-        wrong = int(np.count_nonzero(~same.reshape(len(same), -1).all(axis=1)))
-        if wrong:
-            what = f"{wrong} of {len(same)} voxels differ"
-            yield Finding(f"voxel/{name}", asset.asset_id, what, "what the sources give, merged")
+        yield from _voxel_findings(asset, f"voxel/{name}", same, "what the sources give, merged")
 
 
 def _pair_of(
@@ -337,21 +320,18 @@ def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
     return bool((np.abs(there) <= 1).all()) and missing == values.size - there.size
 
 
-def _claims(
-    asset: StoredAsset, record: AssetRecord, store: Store
-) -> Iterator[tuple[str, object, object]]:
+def _claims(asset: StoredAsset, record: AssetRecord) -> Iterator[tuple[str, object, object]]:
     """Yield the name of each entry that both have, its value in the record and in the store."""
+    store = asset.store
     yield "asset_id", record.asset_id, asset.asset_id
     columns = columns_of(record)
-    del columns["property_ambiguity"]
-    change = record.judgement.ambiguity.property_change
-    said: object = change  # A faulty record may have another number of properties.
+    change = columns["property_ambiguity"]
+    # A faulty record may have another number of properties.
     if len(change) == len(store.normalization.ranges):
-        said = normalize_change([change], store.normalization)[0]
-    yield "property_ambiguity", said, asset.columns["property_ambiguity"]
+        columns["property_ambiguity"] = normalize_change([change], store.normalization)[0]
     for name, column in columns.items():
         yield name, column, store.cached_column(name)[asset.index]
-    grid, background = asset.grid_material, asset.store.contents.background
+    grid, background = asset.grid_material, store.contents.background
     for name, count in (
         ("slat_voxels", len(asset.coords)),
         ("valid", asset.valid.sum()),
@@ -367,12 +347,11 @@ def _claims(
 
 
 def _equal(said: object, held: object) -> bool:
-    if isinstance(said, np.ndarray | float | tuple):
-        if isinstance(said, float) and np.isnan(said):  # Of all channels.
-            return bool(np.isnan(np.asarray(held)).all())
-        numbers = not isinstance(said, np.ndarray) or said.dtype.kind == "f"
-        return np.array_equal(np.asarray(said), np.asarray(held), equal_nan=numbers)
-    return bool(said == held)
+    """Whether values or arrays are equal; a single NaN is that of all channels."""
+    one, other = np.asarray(said), np.asarray(held)
+    if one.ndim and one.shape != other.shape:
+        return False
+    return bool(((one == other) | ((one != one) & (other != other))).all())
 
 
 @lru_cache(maxsize=64)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zarr
 from click.testing import Result
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -16,6 +15,7 @@ from matplotlib.transforms import Bbox
 from scipy.spatial import cKDTree
 from support import commands
 from support.deformed import MOVES
+from support.made_store import rewrite
 from support.synthetic import QUARTER_TURN
 from support.trees import tree
 
@@ -27,8 +27,6 @@ from slatprep.inspect.pictures.alignment import (
     HEIGHT,
     PANEL,
     WIDTH,
-    columns_of,
-    displacement_scale,
     draw_alignment,
     panels,
 )
@@ -45,10 +43,8 @@ def run(*words: object, code: int = 0) -> Result:
     return commands.run("check-alignment", *words, code=code)
 
 
-def misplace(path: Path, row: int, shift: float) -> None:
-    transform = QUARTER_TURN.copy()
-    transform[0, 3] = shift
-    zarr.open_group(path, mode="r+")["asset/transform"][row] = transform
+def misplace(path: Path, shift: float) -> None:
+    rewrite(path, "asset/transform", 0, QUARTER_TURN + shift * np.eye(4, k=3))
 
 
 def of_ant(path: Path) -> tuple[Scene, AlignmentCheck, Alignment]:
@@ -88,15 +84,13 @@ def whole_texts(figure: Figure) -> list[str]:
 # -- the picture ----------------------------------------------------------------
 
 
-def test_the_picture_is_whole_and_the_same_each_time(copy, tmp_path):
-    files = [tmp_path / "one.png", tmp_path / "two.PNG"]
-    for file in files:
-        told = run("--asset", "ant", "--store", copy, "--picture", file).stdout
-        assert f"picture: {file}" in told
-    assert files[0].read_bytes() == files[1].read_bytes()
-    image = imread(files[0])
+def test_the_picture_is_whole_and_the_same_each_time(store, tmp_path):
+    file = tmp_path / "one.PNG"
+    told = run("--asset", "ant", "--store", store, "--picture", file).stdout
+    assert f"picture: {file}" in told
+    image = imread(file, "png")
     assert image.shape[:2] == (HEIGHT, WIDTH)
-    picture = open_store(copy)["ant"].plot()
+    picture = open_store(store)["ant"].plot()
     assert picture.format == "PNG"  # A notebook shows it.
     assert np.array_equal(np.asarray(picture)[..., :3], np.rint(image[..., :3] * 255))
     # No region is blank: the three rows, each of the four columns, each part beside them.
@@ -108,8 +102,8 @@ def test_the_picture_is_whole_and_the_same_each_time(copy, tmp_path):
 @pytest.mark.usefixtures("sides")
 def test_the_next_of_tied_placements_stands_beside_the_chosen_one(copy):
     one, check, alignment = of_ant(copy)
-    turned = one.transform @ QUARTER_TURN
-    ties = tuple(Placement(at, score, 9.0) for at, score in ((one.transform, 0.5), (turned, 0.7)))
+    turned = check.transform @ QUARTER_TURN
+    ties = tuple(Placement(at, score, 9.0) for at, score in ((check.transform, 0.5), (turned, 0.7)))
     tied = replace(alignment, placements=ties, settled_by=None)
     with canvas.styled():
         figure = draw_alignment(one, check, "t", "s", tied)
@@ -117,20 +111,18 @@ def test_the_next_of_tied_placements_stands_beside_the_chosen_one(copy):
     assert "placement that fits about as well" in words
     assert figure.bbox.width == WIDTH + PANEL + 14
     scene = replace(one, tied=turned)
-    assert len(columns_of(scene)) == 5
-    before, after, another, result, error = panels(scene, views(scene, 90)[0])
-    assert np.abs(another - after).sum() > 9
-    alone = panels(one, views(scene, 90)[0])
-    for one, other in zip((before, after, result, error), alone, strict=True):
-        assert np.array_equal(one, other)
+    drawn, alone = (panels(which, views(scene, 90)[0]) for which in (scene, one))
+    assert list(drawn) == ["before", "after", "another", "result", "error"]
+    assert np.abs(drawn.pop("another") - drawn["after"]).sum() > 9
+    assert drawn.keys() == alone.keys()
+    assert all(np.array_equal(drawn[name], alone[name]) for name in alone)
 
 
 @pytest.mark.usefixtures("sides")
 def test_no_words_are_cut_or_written_over_others(copy):
-    group = zarr.open_group(copy, mode="r+")
     for name, value in (("confidence", 0.4), ("expected_accuracy", 0.5), ("contradicted", True)):
-        group[f"asset/{name}"][0] = value
-    misplace(copy, 0, 0.06)
+        rewrite(copy, f"asset/{name}", 0, value)
+    misplace(copy, 0.06)
     scene, check, alignment = of_ant(copy)
     for search in Search:
         with canvas.styled():
@@ -149,7 +141,7 @@ def test_the_names_of_many_classes_stay_on_the_picture(count, copy):
     many = replace(
         one,
         slat_material=(np.arange(len(one.slat)) % count).astype(np.uint8),
-        pixieverse_material=np.zeros(len(one.pixieverse), np.uint8),
+        before=one.before._replace(material=np.zeros(len(one.before.voxels), np.uint8)),
         labels=tuple(f"material {k}" for k in range(count)),
     )
     with canvas.styled():
@@ -169,20 +161,18 @@ def test_a_picture_for_a_paper_is_of_lines_and_letters(kind, copy, tmp_path, sid
     assert sides == {2 * PANEL}
     assert files[0].read_bytes() == files[1].read_bytes()
     assert files[0].read_bytes()[:5] in (b"<?xml", b"%PDF-")
-    several = run("--worst", "2", "--store", copy, "--picture", files[0], code=2)
-    assert "need a folder" in several.stderr
 
 
 def test_a_wrong_transform_is_drawn_worse(copy):
     store = open_store(copy)
     scene = scene_of(store.asset("ant"))
-    misplace(copy, 0, 0.1)
+    misplace(copy, 0.1)
     wrong = scene_of(open_store(copy).asset("ant"))
     assert scene.error.max() < 0.01
     assert wrong.error.mean() > 2
     for right, bad in zip(views(scene, 80), views(wrong, 80), strict=True):
         # The scale of distances goes from light to dark.
-        ink_right, ink_bad = (1 - panels(s, v)[3] for s, v in ((scene, right), (wrong, bad)))
+        ink_right, ink_bad = (1 - panels(s, v)["error"] for s, v in ((scene, right), (wrong, bad)))
         assert ink_bad.sum() > 1.5 * ink_right.sum()
 
 
@@ -194,23 +184,24 @@ def test_a_deformation_is_shown_before_and_after_and_as_displacement(deformed_bu
         lattice = cKDTree(asset.coords.astype(float))
         distance, _ = lattice.query(scene.deformed.voxels.astype(float))
         assert np.mean(distance <= 1.0) > 0.95
-        material = asset.grid_material[tuple(scene.pixieverse.T)]
+        material = asset.grid_material[tuple(scene.before.voxels.T)]
         assert set(np.unique(scene.deformed.material)) == set(np.unique(material))
         # Measured from the similarity: what the truth says, less what that takes of it.
         true_places = MOVES[asset.asset_id](voxel_centres(asset.coords))
         similar = apply_transform(invert_transform(asset.transform), voxel_centres(asset.coords))
         moved = np.linalg.norm(true_places - similar, axis=1) * 64
-        assert np.median(np.abs(scene.deformed.displacement - moved)) < 0.7
+        assert np.median(np.abs(scene.displacement - moved)) < 0.7
         # Where the voxels truly lie they are as near to the surface as two lattices can be.
-        surface = cKDTree(voxel_centres(scene.pixieverse))
+        surface = cKDTree(voxel_centres(scene.before.voxels))
         least, _ = surface.query(MOVES[asset.asset_id](voxel_centres(scene.surface)))
         assert np.median(scene.error) < 64 * np.median(least) + 0.1
         assert np.quantile(scene.error, 0.9) < 0.4 * np.quantile(scene.error_before, 0.9)
         for view in views(scene, 90):
-            before, similarity, deformed, displacement, result, error = panels(scene, view)
-            assert np.abs(similarity - before).sum() > 9
-            assert np.abs(deformed - similarity).sum() > 9
-            assert np.abs(displacement - result).sum() > 9 and error.min() < 0.9
+            drawn = panels(scene, view)
+            assert len(drawn) == 6 and drawn["error"].min() < 0.9
+            for name, other in (("similarity", "before"), ("deformed", "similarity"),
+                                ("displacement", "result")):  # fmt: skip
+                assert np.abs(drawn[name] - drawn[other]).sum() > 9
         file = tmp_path / f"{asset.asset_id}.png"
         result = run("--asset", asset.asset_id, "--store", store.path, "--picture", file)
         assert "picture:" in result.stdout, result.output
@@ -221,16 +212,16 @@ def test_a_deformation_is_shown_before_and_after_and_as_displacement(deformed_bu
                 assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
     # The scale under the column goes from the colour of none to that of the largest.
     bar = image[1092, 990:1290, :3]
-    end = displacement_scale(scene.deformed)
+    end = scene.displacement_scale
     np.testing.assert_allclose(bar[[0, -1]], distance_colours(np.array([0, end]), end), atol=0.01)
-    assert end - 1 < scene.deformed.displacement.max() <= end
+    assert end - 1 < scene.displacement.max() <= end
 
 
 def test_the_error_is_the_distance_to_the_nearest_surface_voxel(copy):
-    misplace(copy, 0, 0.03)
+    misplace(copy, 0.03)
     scene = scene_of(open_store(copy).asset("ant"))
-    points = apply_transform(invert_transform(scene.transform), voxel_centres(scene.surface))
-    here = voxel_centres(scene.pixieverse)
+    points = apply_transform(invert_transform(scene.after.transform), voxel_centres(scene.surface))
+    here = voxel_centres(scene.before.voxels)
     some = slice(0, None, 40)
     expected = [np.linalg.norm(here - point, axis=1).min() * 64 for point in points[some]]
     np.testing.assert_allclose(scene.error[some], expected, atol=1e-9)
@@ -250,28 +241,28 @@ def test_a_place_that_cannot_be_written_is_named(copy, tmp_path):
 # -- which assets ---------------------------------------------------------------
 
 
-def test_worst_and_ambiguous_choose_by_the_stores_figures(copy):
-    group = zarr.open_group(copy, mode="r+")
-    assert list(group["asset/id"][:]) == ["ant", "bear.front", "bear.side", "cup", "dog"]
-    group["asset/fitness"][:] = [0.9, 0.5, 1.0, np.nan, 0.7]
-    group["asset/fitness_backward"][:] = [0.3, 0.9, 1.0, 1.0, 0.6]
-    group["asset/ambiguity"][:] = [0.0, 0.2, 0.9, 0.05, 0.01]
-    store = open_store(copy)
+def test_worst_and_ambiguous_choose_by_the_stores_figures(mixed_build, monkeypatch):
+    store = open_store(str(mixed_build.store))
+    assert store.ids == ["ant", "bear.front", "bear.side", "cup", "dog"]
+    columns = {
+        "verdict": np.array(["good"] * 5),
+        "confidence": np.full(5, 0.9),
+        "fitness": np.array([0.9, 0.5, 1.0, np.nan, 0.7]),
+        "fitness_backward": np.array([0.3, 0.9, 1.0, 1.0, 0.6]),
+        "ambiguity": np.array([0.0, 0.2, 0.9, 0.05, 0.01]),
+    }
+    monkeypatch.setattr(store, "column", columns.__getitem__)
     assert choose_assets(store, worst=3) == ["cup", "ant", "bear.front"]
     assert choose_assets(store, worst=99) == ["cup", "ant", "bear.front", "dog", "bear.side"]
     assert choose_assets(store, ambiguous=True) == ["bear.side", "bear.front"]
-    group["asset/confidence"][:] = [0.99, 0.97, 0.2, 0.98, np.nan]
-    group["asset/verdict"][:] = np.array(["good", "doubtful", "failed", "good", "good"], object)
-    store = open_store(copy)
-    by_verdict = ["bear.side", "bear.front", "dog", "cup", "ant"]
-    assert choose_assets(store, worst=5) == by_verdict
-    group["asset/confidence"][:] = 0.9
-    group["asset/verdict"][:] = np.array(["good"] * 5, object)
-    store = open_store(copy)
     chosen = choose_assets(store, ["dog", "ant"], worst=2, ambiguous=True)
     assert chosen == ["dog", "ant", "cup", "bear.side", "bear.front"]
     with pytest.raises(StoreError, match="no asset"):
         choose_assets(store, ["nobody"], worst=1)
+    columns["confidence"] = np.array([0.99, 0.97, 0.2, 0.98, np.nan])
+    columns["verdict"] = np.array(["good", "doubtful", "failed", "good", "good"])
+    by_verdict = ["bear.side", "bear.front", "dog", "cup", "ant"]
+    assert choose_assets(store, worst=5) == by_verdict
 
 
 def test_several_assets_get_a_file_each_and_a_contact_sheet(copy, tmp_path):
@@ -291,16 +282,15 @@ def test_several_assets_get_a_file_each_and_a_contact_sheet(copy, tmp_path):
 
 def test_one_file_cannot_hold_several_assets_and_none_is_no_failure(copy):
     told = run("--worst", "2", "--store", copy, "--picture", "all.png", code=2).stderr
-    assert "folder" in told
-    zarr.open_group(copy, mode="r+")["asset/ambiguity"][:] = 0.0
+    assert "need a folder" in told
+    rewrite(copy, "asset/ambiguity", slice(None), 0.0)
     assert "no asset is ambiguous" in run("--ambiguous", "--store", copy).stdout
     assert not copy.with_name("copy.pictures").exists()
 
 
 @pytest.mark.usefixtures("sides")
 def test_an_id_becomes_a_safe_file_name(copy, tmp_path):
-    names = zarr.open_group(copy, mode="r+")["asset/id"]
-    names[:] = np.array(["../ant", *names[1:]], dtype=object)
+    rewrite(copy, "asset/id", 0, "../ant")
     store = open_store(copy)
     (file,), sheet = write_pictures(store, [check_alignment(store, "../ant")], tmp_path / "safe")
     assert file.parent == tmp_path / "safe" and file.exists() and sheet is None
@@ -329,7 +319,7 @@ def test_without_a_screen_show_says_where_the_picture_is_also_of_a_broken_store(
     file = tmp_path / "ant.png"
     told = run("--asset", "ant", "--store", copy, "--picture", file, "--show").stderr
     assert "no screen" in told and str(file) in told
-    misplace(copy, 0, 0.4)
+    misplace(copy, 0.4)
     file = copy.with_name("copy.pictures") / "ant.png"
     assert str(file) in run("--asset", "ant", "--store", copy, "--show", code=1).stderr
     assert imread(file).shape[:2] == (HEIGHT, WIDTH)
