@@ -7,7 +7,7 @@ format's writer, and moves the result into place when it is complete.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
@@ -125,9 +125,10 @@ def export_store(
             sizes = [file.stat().st_size]
     else:
         with target.directory(out) as directory:
+            starts = range(0, len(ids), writer.batch)
             tasks = (
-                (writer.write, opened, directory, number, batched)
-                for number, batched in enumerate(_batches(ids, writer.batch))
+                (writer.write, opened, directory, number, ids[start : start + writer.batch])
+                for number, start in enumerate(starts)
             )
             for part in run_unordered(_write_batch, tasks, jobs):
                 entries += part
@@ -182,7 +183,3 @@ def _about(store: Store, format: str) -> dict[str, Any]:
         "latents": asdict(store.contents.latents),
         "normalization": attributes["normalization"],
     }
-
-
-def _batches(ids: Sequence[str], size: int) -> Iterator[Sequence[str]]:
-    return (ids[start : start + size] for start in range(0, len(ids), size))

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slatprep.export.formats import Exported, ExportOptions, Writer, describe_columns, with_merged
+from slatprep.export.formats import Exported, ExportOptions, Writer, describe_columns
 from slatprep.export.target import FORMAT
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
@@ -26,11 +26,11 @@ _DATASETS: dict[str, dict[str, Any]] = {
     "valid": {"description": "an annotation was found near enough"},
     "distance": {"description": "distance to the annotation used", "units": "voxel"},
     "place": {"description": "where it was looked up, PixieVerse frame, [-0.5, 0.5]^3"},
-    "spread": {"description": "standard deviation of normalised properties over the annotations"},
-    "votes": {"description": "share of the annotations that give the class"},
     "transform": {
         "description": "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3"
     },
+    "spread": {"description": "standard deviation of normalised properties over the annotations"},
+    "votes": {"description": "share of the annotations that give the class"},
 }
 
 
@@ -60,8 +60,9 @@ def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> I
 def _write_group(file: h5py.File, asset: StoredAsset) -> None:
     group = file.create_group(file_name(asset.asset_id))
     group.attrs.update(describe_columns(asset))
-    names = with_merged(asset.store, *(name for name in _DATASETS if name not in MERGED_COLUMNS))
-    for name, attributes in ((name, _DATASETS[name]) for name in names):
+    for name, attributes in _DATASETS.items():
+        if name in MERGED_COLUMNS and not asset.store.merges:
+            continue
         packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
         dataset = group.create_dataset(name, data=getattr(asset, name), **packing)
         dataset.attrs.update(attributes)

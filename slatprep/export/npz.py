@@ -93,17 +93,14 @@ def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]
 def _stem(asset_id: str) -> str:
     """Return a name for an asset's file that pandas reads as the same text."""
     name = file_name(asset_id)
-    try:
-        if name == str(int(name)) and len(name) < 19:  # It survives as int64.
-            return name
-    except ValueError:
-        pass
+    if name.isdecimal() and len(name) < 19 and name == str(int(name)):  # It survives as int64.
+        return name
+    encoded = f"%{ord(name[0]):02X}{name[1:]}"
     try:
         float(name)
     except ValueError:
-        if name.casefold() not in _NO_WORDS:
-            return name
-    return f"%{ord(name[0]):02X}{name[1:]}"
+        return encoded if name.casefold() in _NO_WORDS else name
+    return encoded
 
 
 def webdataset(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:

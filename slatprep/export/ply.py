@@ -90,21 +90,16 @@ def write(
     ``part_label`` is the class, as in Pixie's own predictions.
     """
     for asset in assets:
-        table = asset.store.contents.properties
-        solid = asset.store.columns_of(PROPERTY_COLUMNS)
-        others = [column for column in range(len(table)) if column not in solid]
         there = annotated_points(asset, points)
         conf = np.clip(1.0 - there.distance / max_distance, 0.0, 1.0)
         positions = there.in_slat
         if frame == "pixieverse":
             positions = to_world(there.in_pixieverse, bounds[asset.asset_id])
         name = f"{file_name(asset.asset_id)}.ply"
-        more = {
-            (table[column].name, table[column].unit): there.values[:, column] for column in others
-        }
-        solids = there.solid(asset)
-        material = there.material
-        write_points(directory / name, positions, material, solids, conf, _COMMENTS[frame], more)
+        columns = zip(asset.store.contents.properties, there.values.T, strict=True)
+        more = {(of.name, of.unit): own for of, own in columns if of.name not in PROPERTY_COLUMNS}
+        solid, material = there.solid(asset), there.material
+        write_points(directory / name, positions, material, solid, conf, _COMMENTS[frame], more)
         yield Exported(asset, name, len(material))
 
 
@@ -151,10 +146,8 @@ def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tu
         for asset_id, one in stated.items()
     }
     missing = sum(not one for one in stated.values())
-    if not missing:
-        return bounds, ()
     note = f"{missing:,} assets have no world bounds; Pixie's default -0.5..0.5 was taken"
-    return bounds, (note,)
+    return bounds, (note,) if missing else ()
 
 
 def _bounds(stated: dict[str, Any], where: str) -> Bounds:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError
 from slatprep.export import croissant, export_store, target
 from slatprep.export.croissant import Stated
-from slatprep.records import USABLE, Place
+from slatprep.records import USABLE, Place, Verdict
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store import Store, open_store
@@ -173,10 +173,7 @@ def card_of(
         "---\n" + "\n".join(lines) + "\n---",
         f"# {_plain(title)}",
         croissant.DESCRIPTION,
-        *(
-            f"![Some of the assets, aligned, and the error of each voxel]({one})"
-            for one in pictures
-        ),
+        *(f"![Some of the assets, aligned, and the error of each voxel]({n})" for n in pictures),
         "## What is in it",
         "\n".join(_table(store, kept)),
         "`good`, `doubtful` and `failed` are verdicts on the alignment; `labels_right` is the "
@@ -205,10 +202,9 @@ def _table(store: Store, kept: NDArray[np.bool_]) -> Iterator[str]:
         for name in ("category", "verdict", "confidence", "expected_accuracy", "valid_share")
     }
     columns["voxels"] = np.diff(store.offsets)[kept]
-    figures = ("good", "doubtful", "failed", "confidence", "labels_right", "valid")
-    head = ("category", "assets", "voxels", *figures)
-    yield f"| {' | '.join(head)} |"
-    yield "| --- |" + " ---: |" * (len(head) - 1)
+    figures = "good | doubtful | failed | confidence | labels_right | valid"
+    yield f"| category | assets | voxels | {figures} |"
+    yield "| --- |" + " ---: |" * 8
     names = sorted(set(map(str, columns["category"])))
     for name in names:
         yield _row(_plain(name) or "(unknown)", columns, columns["category"] == name)
@@ -218,17 +214,11 @@ def _table(store: Store, kept: NDArray[np.bool_]) -> Iterator[str]:
 
 def _row(name: str, columns: dict[str, NDArray[Any]], chosen: NDArray[np.bool_]) -> str:
     own = {column: values[chosen] for column, values in columns.items()}
-    verdicts = Counter(map(str, own["verdict"]))
-    voxels = int(own["voxels"].sum())
-    valid = float(own["valid_share"] @ own["voxels"]) / max(voxels, 1)
-    cells = (
-        name,
-        f"{np.count_nonzero(chosen):,}",
-        f"{voxels:,}",
-        *(f"{verdicts[verdict]:,}" for verdict in ("good", "doubtful", "failed")),
-        *(f"{np.median(own[figure]):.3f}" for figure in ("confidence", "expected_accuracy")),
-        f"{valid:.3f}",
-    )
+    verdicts, voxels = Counter(map(str, own["verdict"])), int(own["voxels"].sum())
+    counts = (len(own["verdict"]), voxels, *(verdicts[word] for word in Verdict))
+    medians = (np.median(own[figure]) for figure in ("confidence", "expected_accuracy"))
+    shares = (*medians, own["valid_share"] @ own["voxels"] / max(voxels, 1))
+    cells = (name, *(f"{count:,}" for count in counts), *(f"{share:.3f}" for share in shares))
     return f"| {' | '.join(cells)} |"
 
 

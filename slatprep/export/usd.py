@@ -92,10 +92,8 @@ def write(
 
 def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
     """Write the scene: gravity, ground, and a reference to each asset; return its name."""
-    geom, tf = _pxr("UsdGeom"), _pxr("Tf")
-    stage = _stage(directory / SCENE)
-    world = geom.Xform.Define(stage, "/World")
-    stage.SetDefaultPrim(world.GetPrim())
+    geom, tf = _pxr("UsdGeom", "Tf")
+    stage, _ = _stage(directory / SCENE, "/World")
     # The grid of the solver is one for all: as fine as the finest asset needs.
     _simulation(stage, "/World", min(entry["spacing"] for entry in entries))
     columns = int(np.ceil(np.sqrt(len(entries))))
@@ -121,10 +119,8 @@ def _write_asset(
     binned: Binned,
 ) -> None:
     """Write an asset: points (N, 3) [m] of cubes `width` [m] wide, E, density, nu (N, 3)."""
-    geom, sdf, vt, shade = _pxr("UsdGeom"), _pxr("Sdf"), _pxr("Vt"), _pxr("UsdShade")
-    stage = _stage(path)
-    root = geom.Xform.Define(stage, "/Asset")
-    stage.SetDefaultPrim(root.GetPrim())
+    geom, sdf, vt, shade = _pxr("UsdGeom", "Sdf", "Vt", "UsdShade")
+    stage, root = _stage(path, "/Asset")
     root.GetPrim().SetCustomDataByKey("slatprep:asset_id", asset_id)
     _simulation(stage, "", width)
     lowest = float(positions[:, 2].min()) if len(positions) else 0.0
@@ -141,9 +137,8 @@ def _write_asset(
         extent = np.array([positions.min(axis=0) - half, positions.max(axis=0) + half])
         points.CreateExtentAttr(vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
         masses = vt.FloatArray.FromNumpy((solid[:, 1] * width**3).astype(np.float32))
-        prim.CreateAttribute("physics:masses", sdf.ValueTypeNames.FloatArray, custom=False).Set(
-            masses
-        )
+        kind = sdf.ValueTypeNames.FloatArray
+        prim.CreateAttribute("physics:masses", kind, custom=False).Set(masses)
         colours = (COLOURS[binned.material[binned.rows]] / 255).astype(np.float32)
         shown = points.CreateDisplayColorPrimvar(geom.Tokens.vertex)
         shown.Set(vt.Vec3fArray.FromNumpy(colours))
@@ -158,7 +153,7 @@ def _add_material(
     stage: Any, binding: Any, number: int, material: int, solid: NDArray[np.float64], binned: Binned
 ) -> None:
     """Add a material, and the subset of the points that it is bound to."""
-    geom, sdf, vt, shade = _pxr("UsdGeom"), _pxr("Sdf"), _pxr("Vt"), _pxr("UsdShade")
+    geom, sdf, vt, shade = _pxr("UsdGeom", "Sdf", "Vt", "UsdShade")
     name = f"{MATERIAL_CLASSES[material]}_{number:03d}"
     made = shade.Material.Define(stage, f"/Asset/Materials/{name}")
     prim = made.GetPrim()
@@ -181,7 +176,7 @@ def _add_material(
 
 def _simulation(stage: Any, parent: str, width: float) -> None:
     """Add what a simulation needs beside particles `width` [m] wide: solver, gravity, ground."""
-    geom, physics, sdf = _pxr("UsdGeom"), _pxr("UsdPhysics"), _pxr("Sdf")
+    geom, physics, sdf = _pxr("UsdGeom", "UsdPhysics", "Sdf")
     scene = physics.Scene.Define(stage, f"{parent}/PhysicsScene")
     scene.CreateGravityDirectionAttr((0.0, 0.0, -1.0))
     scene.CreateGravityMagnitudeAttr(9.81)
@@ -205,14 +200,16 @@ def _simulation(stage: Any, parent: str, width: float) -> None:
     physics.CollisionAPI.Apply(ground.GetPrim())
 
 
-def _stage(path: Path) -> Any:
-    """Return a new stage in metres and kilograms, z up."""
-    geom, physics = _pxr("UsdGeom"), _pxr("UsdPhysics")
-    stage = _pxr("Usd").Stage.CreateNew(str(path))
+def _stage(path: Path, name: str) -> tuple[Any, Any]:
+    """Return a new stage in metres and kilograms, z up, and its root of that name."""
+    usd, geom, physics = _pxr("Usd", "UsdGeom", "UsdPhysics")
+    stage = usd.Stage.CreateNew(str(path))
     geom.SetStageMetersPerUnit(stage, 1.0)
     physics.SetStageKilogramsPerUnit(stage, 1.0)
     geom.SetStageUpAxis(stage, geom.Tokens.z)
-    return stage
+    root = geom.Xform.Define(stage, name)
+    stage.SetDefaultPrim(root.GetPrim())
+    return stage, root
 
 
 def _edge(asset: StoredAsset, points: formats.Points) -> float:
@@ -237,10 +234,10 @@ def _remarks(entries: Sequence[dict[str, Any]]) -> tuple[str, ...]:
     return tuple(remarks)
 
 
-def _pxr(name: str) -> Any:
-    """Import a module of OpenUSD."""
+def _pxr(*names: str) -> list[Any]:
+    """Import modules of OpenUSD."""
     try:
-        return import_module(f"pxr.{name}")
+        return [import_module(f"pxr.{name}") for name in names]
     except ImportError as error:
         raise ConfigError(
             "USD needs the package usd-core; install it with `pip install 'slatprep[usd]'`"
@@ -271,6 +268,8 @@ def bin_materials(material: NDArray[np.uint8], solid: NDArray[np.float64], most:
     Bins are as fine as `most` allows, and no bin has rows of two classes. E and nu of a bin
     lie in the middle of its members (E in its logarithm), so that the largest error is least.
     """
+    from scipy import ndimage
+
     logarithm = np.log10(solid[:, 0])
     width = _FINEST
     while True:
@@ -282,8 +281,11 @@ def bin_materials(material: NDArray[np.uint8], solid: NDArray[np.float64], most:
             if len(bins) <= most:
                 break
         width *= 1.25
-    rows = rows.reshape(-1)
-    middle = [_middles(values, rows, len(bins)) for values in (logarithm, solid[:, 2])]
+    rows, every = rows.reshape(-1), np.arange(len(bins))
+    middle = [
+        (ndimage.minimum(values, rows, every) + ndimage.maximum(values, rows, every)) / 2
+        for values in (logarithm, solid[:, 2])
+    ]
     modulus, ratio = 10 ** middle[0], middle[1]
     return Binned(
         bins[:, 0].astype(np.uint8),
@@ -306,14 +308,3 @@ def _cover(values: NDArray[np.float64], width: float, most: int) -> NDArray[np.i
         starts.append(next_start)
         next_start = int(np.searchsorted(ordered, ordered[next_start] + width, side="right"))
     return np.searchsorted(ordered[starts], values, side="right") - 1
-
-
-def _middles(
-    values: NDArray[np.float64], rows: NDArray[np.intp], count: int
-) -> NDArray[np.float64]:
-    """Return the middle between least and largest value of each bin (count,)."""
-    low, high = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(low, rows, values)
-    np.maximum.at(high, rows, values)
-    middle: NDArray[np.float64] = (low + high) / 2
-    return middle

@@ -4,7 +4,6 @@ import glob
 import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,13 +17,15 @@ import pytest
 import zarr
 from click.testing import Result
 from support import commands
+from support.faults import flip
+from support.made_store import rewrite
 from support.published_hub import PublishedHub
 from support.trees import tree
 
 from slatprep.export.croissant import Stated, describe, to_json
 from slatprep.export.publish import card_of
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.store import open_store
+from slatprep.store import Store, open_store
 from slatprep.store.layout import ARRAYS
 
 
@@ -75,15 +76,12 @@ def test_the_card_is_read_by_the_hubs_library(root):
     assert document["distribution"][0]["contentUrl"] == "mixed.zarr/zarr.json"
 
 
-def test_a_damaged_store_is_not_published(mixed_build, tmp_path):
-    store = Path(shutil.copytree(str(mixed_build.store), tmp_path / "s.zarr"))
-    words = (store, "--out", tmp_path / "hub", "--pictures", 0)
+def test_a_damaged_store_is_not_published(copy, tmp_path):
+    words = (copy, "--out", tmp_path / "hub", "--pictures", 0)
     run(*words)
     before = tree(tmp_path / "hub")
-    shard = store / "voxel/feats/c/0/0"
-    content = bytearray(shard.read_bytes())
-    content[100] ^= 1
-    shard.write_bytes(content)
+    shard = copy / "voxel/feats/c/0/0"
+    flip(shard, 100)
     told = run(*words, code=1).stderr
     assert tree(tmp_path / "hub") == before
     assert "voxel/feats/c/0/0: its bytes changed" in told
@@ -92,12 +90,11 @@ def test_a_damaged_store_is_not_published(mixed_build, tmp_path):
     assert "voxel/feats/c/0/0: is a link" in run(*words, code=1).stderr
 
 
-def test_only_assets_that_went_into_shards_are_counted(mixed_build, tmp_path):
-    store = shutil.copytree(str(mixed_build.store), tmp_path / "s.zarr")
-    zarr.open_group(store, mode="r+")["asset/verdict"][0] = "failed"
-    words = (store, "--data", "webdataset", "--pictures", 0, "--json")
+def test_only_assets_that_went_into_shards_are_counted(copy, tmp_path):
+    rewrite(copy, "asset/verdict", 0, "failed")
+    words = (copy, "--data", "webdataset", "--pictures", 0, "--json")
     left = json.loads(run(*words, "--out", tmp_path / "hub").stdout)["assets"]
-    assert left == len(open_store(store)) - 1
+    assert left == len(open_store(copy)) - 1
     card = (tmp_path / "hub" / "README.md").read_text()
     table = card.partition("## What is in it\n\n")[2].partition("\n\n")[0]
     rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
@@ -197,10 +194,15 @@ STATED = {
 }
 
 
+def described(store: Store, folder: Path, **stated: str) -> mlcroissant.Dataset:
+    """Return a store's description as mlcroissant reads it, which raises where it is invalid."""
+    path = folder / "croissant.json"
+    path.write_text(to_json(describe(store, Stated(**stated))), encoding="utf-8")
+    return mlcroissant.Dataset(jsonld=path)
+
+
 def test_croissant_is_valid_without_a_warning(store, tmp_path, caplog):
-    path = tmp_path / "croissant.json"
-    path.write_text(to_json(describe(open_store(store), Stated(**STATED))), encoding="utf-8")
-    dataset = mlcroissant.Dataset(jsonld=path)  # raises where the description is invalid
+    dataset = described(open_store(store), tmp_path, **STATED)
     assert dataset.metadata.ctx.issues.report() == ""
     assert caplog.text == ""
     assert dataset.metadata.name == store.stem
@@ -209,9 +211,7 @@ def test_croissant_is_valid_without_a_warning(store, tmp_path, caplog):
 
 
 def test_croissant_s_records_are_the_store_s(store, tmp_path):
-    path = tmp_path / "croissant.json"
-    path.write_text(to_json(describe(open_store(store))), encoding="utf-8")
-    dataset = mlcroissant.Dataset(jsonld=path)
+    dataset = described(open_store(store), tmp_path)
     group = zarr.open_group(store, mode="r")
     assets = list(dataset.records("assets"))
     assert [row["assets/id"] for row in assets] == list(group["asset/id"][:])
@@ -234,9 +234,7 @@ def test_croissant_describes_figures_that_are_not_numbers(store, tmp_path):
     figures[0] = np.nan
     read = opened.column
     opened.column = lambda name: figures if name == "inlier_rmse" else read(name)
-    path = tmp_path / "croissant.json"
-    path.write_text(to_json(describe(opened)), encoding="utf-8")
-    rows = list(mlcroissant.Dataset(jsonld=path).records("assets"))
+    rows = list(described(opened, tmp_path).records("assets"))
     assert np.isnan(rows[0]["assets/inlier_rmse"]) and rows[1]["assets/inlier_rmse"] == figures[1]
 
 
