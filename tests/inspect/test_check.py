@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import zarr
-from support.synthetic import QUARTER_TURN, Dataset
+from support.made_store import rewrite
+from support.synthetic import MakeDataset
 
 from slatprep.errors import StoreError
 from slatprep.inspect.check import AlignmentCheck, check_alignment, choose_assets
@@ -27,51 +28,38 @@ def test_every_asset_of_a_fresh_store_passes(mixed_build):
 
 
 def test_a_wrong_transform_is_found(copy):
-    group = zarr.open_group(copy, mode="r+")
-    transform = QUARTER_TURN.copy()
-    transform[:3, 3] = 0.4
-    group["asset/transform"][0] = transform
+    rewrite(copy, "asset/transform", (0, slice(3), 3), 0.4)
     check = check_alignment(open_store(copy), "ant")
-    assert not check.ok
-    assert check.verdict is Verdict.FAILED
-    assert check.reasons
+    assert not check.ok and check.verdict is Verdict.FAILED and check.reasons
     assert {"fitness", "fitness_backward", "overlap"} <= wrong(check)
     assert check_alignment(open_store(copy), "cup").ok
 
 
-@pytest.mark.parametrize(
-    ("array", "value", "figure"),
-    [
-        ("voxel/material", 5, "voxels with another material"),
-        ("voxel/valid", False, "voxels with another valid"),
-        ("voxel/properties", 0.123, "largest difference of a property"),
-        ("voxel/properties", np.nan, "largest difference of a property"),
-        ("voxel/distance", 9.0, "largest difference of a distance"),
-    ],
-)
-def test_a_changed_voxel_is_found(copy, array, value, figure):
-    zarr.open_group(copy, mode="r+")[array][3] = value
-    check = check_alignment(open_store(copy), "ant")
-    assert not check.ok
-    assert figure in wrong(check)
-
-
-def test_a_changed_grid_and_a_changed_verdict_are_found(copy):
-    group = zarr.open_group(copy, mode="r+")
-    group["asset/verdict"][1] = "doubtful"
-    check = check_alignment(open_store(copy), "bear.front")
-    assert not check.consistent
-    assert not check.ok
-    material = group["grid/material"][0]
-    group["grid/material"][0] = np.where(material == 0, 6, material)
-    assert "voxels with another material" in wrong(check_alignment(open_store(copy), "ant"))
+def test_changed_voxels_a_changed_grid_and_a_changed_verdict_are_found(copy):
+    figures = {
+        "voxel/material": (5, "voxels with another material"),
+        "voxel/valid": (False, "voxels with another valid"),
+        "voxel/properties": (0.123, "largest difference of a property"),
+        "voxel/distance": (9.0, "largest difference of a distance"),
+    }
+    for row, (array, (value, _)) in enumerate(figures.items()):
+        rewrite(copy, array, row, value)
+    rewrite(copy, "asset/verdict", 1, "doubtful")
+    store = open_store(copy)
+    assert wrong(check_alignment(store, "ant")) == {figure for _, figure in figures.values()}
+    other = check_alignment(store, "bear.front")
+    assert not wrong(other) and not other.consistent and not other.ok
+    rewrite(copy, "voxel/properties", int(store.offsets[3]), np.nan)
+    assert wrong(check_alignment(copy, "cup")) == {"largest difference of a property"}
+    material = store.asset("dog").grid_material
+    rewrite(copy, "grid/material", 4, np.where(material == 0, 6, material))
+    assert wrong(check_alignment(copy, "dog")) == {"voxels with another material"}
     with pytest.raises(StoreError, match="no asset"):
-        check_alignment(open_store(copy), "nobody")
+        check_alignment(store, "nobody")
 
 
-def test_ground_does_not_count_now_either(tmp_path):
-    dataset = Dataset(tmp_path)
-    dataset.add("ant", seed=0)
+def test_ground_does_not_count_now_either(make_dataset: MakeDataset, tmp_path):
+    dataset = make_dataset("ant")
     grid = dataset.assets["ant"].grid
     grid[:, :, 23:26] = grid[20, 22, 26]
     dataset.write_grid("ant", grid)
