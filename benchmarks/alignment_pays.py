@@ -192,7 +192,7 @@ def learn_and_score(
     named = classes.predict(seen)
     ends = np.cumsum([len(one.material) for one in test.values()])[:-1]
     return np.array([
-        score_asset(VoxelPrediction(values, number), one.properties, one.material, one.valid)
+        score_asset(VoxelPrediction(values, number), one._asdict())
         for one, values, number in zip(
             test.values(), np.split(predicted, ends), np.split(named, ends), strict=True
         )

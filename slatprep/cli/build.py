@@ -184,23 +184,18 @@ def _show_damaged(output: Output, damaged: Sequence[str]) -> None:
 def _show_plan(output: Output, plan: BuildPlan) -> None:
     """Print what would be done with each asset, and why; unchanged assets are only counted."""
     _show_damaged(output, plan.damaged)
+    keys = ("asset_id", "action", "reason")
+    assets = [{key: getattr(asset, key) for key in keys} for asset in plan.assets]
 
     def show() -> None:
-        rows = [
-            (asset.asset_id, str(asset.action), asset.reason)
-            for asset in plan.assets
-            if asset.action != "reuse" or output.verbosity > 0
-        ]
-        if rows:
+        shown = [one for one in assets if one["action"] != "reuse" or output.verbosity > 0]
+        if shown:
+            rows = (tuple(one.values()) for one in shown)
             output.table("What would be done", ("asset", "action", "why"), rows)
         counts = ", ".join(f"{count:,} to {action}" for action, count in plan.actions.items())
         say(f"assets:  {len(plan.assets):,} ({counts})")
         say(f"store:   {plan.store} (a dry run: nothing is written)")
 
-    assets = [
-        {"asset_id": asset.asset_id, "action": str(asset.action), "reason": asset.reason}
-        for asset in plan.assets
-    ]
     output.result(vars(plan) | {"actions": plan.actions, "assets": assets}, show)
 
 

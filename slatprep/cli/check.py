@@ -7,7 +7,7 @@ from functools import partial
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -80,14 +80,13 @@ def check_alignment(
     path = options.chosen_store(store or named)
     from slatprep.inspect import check
     from slatprep.pipeline.decoys import measured_errors
-    from slatprep.workers.local import run_unordered
+    from slatprep.workers.local import run_in_order
 
     opened = options.opened(path)
     chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     target = _target(path, picture, len(chosen))
-    run = run_unordered(check.check_alignment, ((opened.path, one) for one in chosen), jobs)
-    found = {one.asset_id: one for one in run}
-    checks = [found[asset_id] for asset_id in chosen]
+    tasks = ((opened.path, asset_id) for asset_id in chosen)
+    checks = list(run_in_order(check.check_alignment, tasks, jobs))
     pictures: list[Path] = []
     sheet = None
     if target is not None and checks:
@@ -99,6 +98,16 @@ def check_alignment(
     measured = measured_errors(opened.path)
     if measured and measured.build != opened.about.manifest:
         measured = None  # It is of before an update.
+    assets = []
+    for one, file in zip_longest(checks, pictures):
+        figures = [
+            asdict(own) | {"ok": own.ok, "good": own.threshold_text, "passes": own.passes}
+            for own in one.figures
+        ]
+        found = {"figures": figures, "consistent": one.consistent, "ok": one.ok, "picture": file}
+        if measured:
+            found["another_object"] = measured.errors.get(one.asset_id, 0.0)
+        assets.append(asdict(one) | found)
 
     def print_all() -> None:
         _print(output, checks)
@@ -113,10 +122,6 @@ def check_alignment(
 
     if show:
         _open_viewer(output, opened, chosen, sheet or (pictures[0] if pictures else None))
-    assets = _documents(checks, pictures)
-    if measured:
-        for one in assets:
-            one["another_object"] = measured.errors.get(one["asset_id"], 0.0)
     document = {"store": path, "assets": assets, "sheet": sheet}
     output.result(document, print_all, complete=all(one.ok for one in checks))
 
@@ -171,18 +176,6 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
                 f"{one.asset_id}: the store says {one.stored_verdict}, and its figures do not all "
                 "agree: it was changed, or another version of slatprep built it"
             )
-
-
-def _documents(checks: list[AlignmentCheck], pictures: list[Path]) -> list[dict[str, Any]]:
-    documents = []
-    for one, file in zip_longest(checks, pictures):
-        figures = [
-            asdict(own) | {"ok": own.ok, "good": own.threshold_text, "passes": own.passes}
-            for own in one.figures
-        ]
-        found = {"figures": figures, "consistent": one.consistent, "ok": one.ok, "picture": file}
-        documents.append(asdict(one) | found)
-    return documents
 
 
 def _open_viewer(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:

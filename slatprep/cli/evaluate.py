@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -85,8 +86,7 @@ def evaluate(
     others = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
-    chosen = _selection(output, predictions, store, split, splits)
-    chosen["spread"] = spread
+    chosen = _selection(output, predictions, store, split, splits) | {"spread": spread}
     part = None if split == "all" else split
     result: Evaluation | Comparison
     baselines: dict[str, Measure] = {}
@@ -96,7 +96,16 @@ def evaluate(
         result = compare_methods(predictions, folders, store, part, **chosen)
         measures = ours = result.methods
         what, problems = "method", result.problems
-        _note_methods(output, result)
+        if problems:
+            output.note(
+                "note:    assets without a usable prediction of some method, left out of all: "
+                f"{len(problems)}"
+            )
+        if result.partly_annotated:
+            output.note(
+                "note:    objects with occupied voxels that have no annotation and are not scored: "
+                f"{result.partly_annotated}; Pixie's loader leaves such objects out"
+            )
     else:
         result = evaluate_store(cast("Path", predictions), store, part, **chosen)
         measures = {name or "(none)": m for name, m in result.categories.items()}
@@ -114,63 +123,51 @@ def evaluate(
     if picture is not None:
         from slatprep.learn.compare import draw_comparison
 
-        draw_comparison(measures, SPREADS[spread], picture)
-        output.note(f"picture: {picture}")
+        options.draw_to(output, picture, partial(draw_comparison, measures, SPREADS[spread]))
 
     output.problems(problems, "--json lists them")
     document = vars(result) | {"store": store}
     if beside:
         document["beside"] = [score for scores in others.values() for score in scores]
-    output.result(
-        document,
-        lambda: _show(output, SPREADS[spread], what, measures | baselines, ours, others),
-        complete=not problems,
-    )
 
-
-def _show(
-    output: Output,
-    spread: str,
-    what: str,
-    measures: Mapping[str, Measure],
-    ours: Mapping[str, Measure],
-    others: Mapping[str, tuple[PublishedScore, ...]],
-) -> None:
-    from slatprep.learn.published import TABLES
-
-    output.table(
-        f"Mean squared error in normalised space, class accuracy (± {spread} over n objects)",
-        (what, "n", *next(iter(measures.values())).means),
-        _in_short(measures),
-    )
-    if TABLES.keys() & others:
-        output.note(
-            "note: those beside were measured on PixieVerse's test objects; they compare only "
-            "with predictions of the same objects, normalised by Pixie's ranges (--ranges pixie)"
+    def show() -> None:
+        names = tuple(next(iter(measures.values())).means)
+        output.table(
+            "Mean squared error in normalised space, class accuracy "
+            f"(± {SPREADS[spread]} over n objects)",
+            (what, "n", *names),
+            [_in_short(name, one) for name, one in (measures | baselines).items()],
         )
-    for name, scores in others.items():
-        _show_beside(output, ours, scores, name)
+        if TABLES.keys() & others:
+            output.note(
+                "note: those beside were measured on PixieVerse's test objects; they compare only "
+                "with predictions of the same objects, normalised by Pixie's ranges (--ranges "
+                "pixie)"
+            )
+        means = {name: one.means for name, one in ours.items()}
+        for name, scores in others.items():
+            title = TABLES[name][0] if name in TABLES else name
+            _show_beside(output, f"Beside {title}", means, scores)
+
+    output.result(document, show, complete=not problems)
 
 
 def _selection(
     output: Output, predictions: Path | None, store: Place, split: str, splits: options.SplitOptions
 ) -> dict[str, Any]:
     """Return the split of each object and which assets count, by the options or else by a run."""
-    from slatprep.learn.predictions import RUN_FILE, selection_of_run
-    from slatprep.learn.splits import assign_store
+    from slatprep.learn.predictions import selection_of_run
 
+    filters: dict[str, Any] = {}
     rule, how = splits.rule, f"by {splits.rule['by']}"
-    selection: dict[str, Any] | None = None
-    if predictions is not None and not splits.given:
-        selection = selection_of_run(predictions)
-    if predictions is not None and selection is not None:
-        rule |= {name: selection.pop(name) for name in ("by", "shares") if name in selection}
-        how = f"as {predictions.absolute().parent / RUN_FILE} says"
+    run = selection_of_run(predictions) if predictions and not splits.given else None
+    if run is not None:
+        file, rule, filters = run
+        how = f"as {file} says"
     elif not splits.given:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
-    assignment = assign_store(options.opened(store), **rule)
-    options.note_split(output, assignment, f"{split}, {how}")
-    return {"splits": assignment.splits, **(selection or {})}
+    opened = options.opened(store)
+    return {"splits": options.split_of_objects(output, opened, rule, f"{split}, {how}"), **filters}
 
 
 def _folders(grids: tuple[str, ...]) -> dict[str, Path]:
@@ -192,19 +189,6 @@ def _folders(grids: tuple[str, ...]) -> dict[str, Path]:
     return folders
 
 
-def _note_methods(output: Output, result: Comparison) -> None:
-    if result.problems:
-        output.note(
-            "note:    assets without a usable prediction of some method, left out of all: "
-            f"{len(result.problems)}"
-        )
-    if result.partly_annotated:
-        output.note(
-            "note:    objects with occupied voxels that have no annotation and are not scored: "
-            f"{result.partly_annotated}; Pixie's loader leaves such objects out"
-        )
-
-
 def _write_csv(file: Path, what: str, measures: Mapping[str, Measure], spread: str) -> None:
     metrics = next(iter(measures.values())).means
     names = (name for mean in metrics for name in (mean, f"{mean} {spread}"))
@@ -216,16 +200,14 @@ def _write_csv(file: Path, what: str, measures: Mapping[str, Measure], spread: s
 
 
 def _show_beside(
-    output: Output, ours: Mapping[str, Measure], others: tuple[PublishedScore, ...], beside: str
+    output: Output,
+    title: str,
+    ours: Mapping[str, Mapping[str, float]],
+    others: tuple[PublishedScore, ...],
 ) -> None:
-    from slatprep.learn.published import TABLES
-
-    names = tuple(next(iter(ours.values())).means)
-    rows: list[tuple[str | float | None, ...]] = [
-        (name, *measure.means.values()) for name, measure in ours.items()
-    ]
-    rows += [(score.method, *map(score.means.get, names)) for score in others]
-    title = f"Beside {TABLES[beside][0] if beside in TABLES else beside}"
+    names = tuple(next(iter(ours.values())))
+    means = [*ours.items(), *((score.method, score.means) for score in others)]
+    rows = [(name, *map(own.get, names)) for name, own in means]
     output.table(title, ("method", *names), rows)
     spreads = [
         (one.method, *map(one.spreads.get, names), one.spread) for one in others if one.spreads
@@ -234,13 +216,8 @@ def _show_beside(
         output.table("Their spreads, as printed", ("method", *names, "kind"), spreads)
 
 
-def _in_short(measures: Mapping[str, Measure]) -> list[tuple[str | int, ...]]:
-    """Return the rows of the printed table: each mean with its spread, if there is one."""
-
-    def cell(mean: float, spread: float) -> str:
-        return f"{mean:.3f}" if math.isnan(spread) else f"{mean:.3f}±{spread:.3f}"
-
-    return [
-        (name, one.objects, *map(cell, one.means.values(), one.spreads.values()))
-        for name, one in measures.items()
-    ]
+def _in_short(name: str, scores: Measure) -> tuple[str | int, ...]:
+    """Return a row of the printed table: each mean with its spread, if there is one."""
+    cells = zip(scores.means.values(), scores.spreads.values(), strict=True)
+    texts = (f"{mean:.3f}" + ("" if math.isnan(s) else f"±{s:.3f}") for mean, s in cells)
+    return name, scores.objects, *texts

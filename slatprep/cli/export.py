@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from slatprep.cli import options
-from slatprep.cli.output import Output, say
+from slatprep.cli.output import Output, new_file, say
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
 from slatprep.storage.place import storage_of
 
 if TYPE_CHECKING:
-    from slatprep.records import Place
     from slatprep.store import Store
 
 # The formats of each option; giving it with another format is an error.
@@ -116,21 +114,24 @@ def export(
     """
     given = format_options.of(kind)
     from slatprep.export import ExportOptions, export_store
+    from slatprep.records import USABLE
 
+    if split == "all" and splits.given:
+        raise ConfigError("--split-by and --shares define splits; choose one with --split")
+    if split != "all" and assets:
+        raise ConfigError("--asset and --split both choose; give one of them")
     if verdicts is None and not assets:
         options.note_left_out(output, options.opened(store))
-    chosen: tuple[Sequence[str], Sequence[str] | None] = (assets, verdicts)
+        verdicts = USABLE
     if split != "all":
-        chosen = _of_split(output, store, split, splits.rule, assets, verdicts)
-    elif splits.given:
-        raise ConfigError("--split-by and --shares define splits; choose one with --split")
+        assets = _of_split(output, options.opened(store), split, splits.rule)
     with output.progress("export") as progress:
         summary = export_store(
             store,
             out,
             kind,
-            assets=chosen[0],
-            verdicts=chosen[1],
+            assets=assets,
+            verdicts=verdicts,
             options=ExportOptions(**given),
             jobs=jobs,
             progress=progress,
@@ -143,27 +144,16 @@ def export(
     output.made(summary, lambda: output.record(f"Exported to {summary.path}", cells))
 
 
-def _of_split(
-    output: Output,
-    place: Place,
-    split: Any,
-    rule: dict[str, Any],
-    assets: Sequence[str],
-    verdicts: Sequence[str] | None,
-) -> tuple[list[str], Sequence[str]]:
-    """Return the assets of a split and the verdicts that may go out."""
-    from slatprep.learn.splits import assign_store, select_assets
-    from slatprep.records import USABLE
+def _of_split(output: Output, store: Store, split: Any, rule: dict[str, Any]) -> tuple[str, ...]:
+    """Return the assets of a split."""
+    from slatprep.learn.splits import select_assets
 
-    if assets:
-        raise ConfigError("--asset and --split both choose; give one of them")
-    store = options.opened(place)
-    assignment = assign_store(store, **rule)
-    options.note_split(output, assignment, f"{split}, by {rule['by']}")
-    rows = select_assets(store, split, splits=assignment.splits)
+    which = f"{split}, by {rule['by']}"
+    splits = options.split_of_objects(output, store, rule, which)
+    rows = select_assets(store, split, splits=splits)
     if not len(rows):
-        raise ConfigError(f"{store.path}: no asset is in the split {split}, by {rule['by']}")
-    return [store.ids[row] for row in rows], USABLE if verdicts is None else verdicts
+        raise ConfigError(f"{store.path}: no asset is in the split {which}")
+    return tuple(store.ids[row] for row in rows)
 
 
 @command()
@@ -269,7 +259,6 @@ def describe(
     slatprep describe data/demo.zarr --out demo.croissant.json --name demo
     """
     from slatprep.export import croissant
-    from slatprep.storage.atomic import staged, writing
 
     if not location:
         local, beside = storage_of(store).local, out.parent if out else Path()
@@ -283,6 +272,6 @@ def describe(
     if out is None:
         say(text, nl=False)
         return
-    with writing(str(out), out.parent), staged(out) as path:
+    with new_file(out) as path:
         path.write_text(text, encoding="utf-8")
     output.note(f"description: {out}")

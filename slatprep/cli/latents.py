@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -54,7 +55,6 @@ class LatentsReader:
         files = [] if self.store else discover_slats(SlatSource(root=source, encoder=space.encoder))
         self.files = {file.asset_id: file for file in files}
         there = self.store.ids if self.store else list(self.files)
-        self.rows = {asset_id: row for row, asset_id in enumerate(there)}
         if self.store:
             chosen = {there[self.store.match(name)] for name in assets}
             _require_encoder(source, self.store.contents.latents, space)
@@ -88,42 +88,37 @@ class LatentsReader:
 
         if self.standardised != "auto":
             return replace(latents, standardised=self.standardised == "yes")
-        if not self._look_standardised(latents):
+        moments, path = latents.moments, latents.sources[0].path
+        how = contents.in_words(moments)
+        enough = len(latents.coords) >= contents.ENOUGH
+        if enough and not contents.tell_alone(moments, self.space):
+            known = self._moments_of_files()
+            if len(known) < 2:
+                raise InputError(
+                    path,
+                    f"one file alone does not tell whether its latents have been standardised "
+                    f"({how})",
+                    "--standardised yes or no",
+                )
+            moments = contents.pooled_moments(known)
+        if not contents.look_standardised(moments, self.space):
             return latents
-        how = contents.in_words(latents.moments)
         self.output.note(
-            f"{latents.sources[0].path}: its latents look standardised already ({how}) and are "
-            "taken so; --standardised says otherwise"
+            f"{path}: its latents look standardised already ({how}) and are taken so; "
+            "--standardised says otherwise"
         )
         return replace(latents, standardised=True)
 
-    def _look_standardised(self, latents: StructuredLatents) -> bool:
-        """Whether latents look standardised; asks the other files where they alone do not tell."""
-        from slatprep.readers import contents
-
-        moments = latents.moments
-        if len(latents.coords) < contents.ENOUGH or contents.tell_alone(moments, self.space):
-            return contents.look_standardised(moments, self.space)
-        known = list(self._moments_of_files())
-        if len(known) < 2:
-            raise InputError(
-                latents.sources[0].path,
-                "one file alone does not tell whether its latents have been standardised "
-                f"({contents.in_words(moments)})",
-                "--standardised yes or no",
-            )
-        return contents.look_standardised(contents.pooled_moments(known), self.space)
-
-    def _moments_of_files(self) -> Iterator[tuple[int, LatentMoments]]:
-        """Yield voxels and moments of the first files that can be read."""
+    def _moments_of_files(self) -> list[tuple[int, LatentMoments]]:
+        """Return voxels and moments of the first files that can be read."""
         from slatprep.readers.slat import read_slat
 
+        known = []
         for file in [one for one in self.files.values() if not one.problem][:_ASKED]:
-            try:
+            with suppress(InputError, StoreError):
                 latents = read_slat(file.path, file.root, file.group, self.space)
-            except (InputError, StoreError):
-                continue
-            yield len(latents.coords), latents.moments
+                known.append((len(latents.coords), latents.moments))
+        return known
 
     def _latents(self, asset_id: str) -> StructuredLatents:
         from slatprep.readers.slat import checked_latents, read_slat
@@ -133,7 +128,7 @@ class LatentsReader:
             if file.problem:
                 raise InputError(file.path, file.problem, "one SLAT an id")
             return self._of_file(read_slat(file.path, file.root, file.group, self.space))
-        rows = self.store.read(self.rows[asset_id], ("coords", "feats"))
+        rows = self.store.read(asset_id, ("coords", "feats"))
         space, where = self.store.contents.latents, f"{self.store.path} [{asset_id}]"
         latents = checked_latents(rows["coords"], rows["feats"], where, space=space)
         return replace(latents, standardised=space.standardised)
@@ -232,22 +227,19 @@ def extract_slat(
 
     extractions = work.list_extractions(images, out, seeds, by_folder)
     session = model.load(output)
-    done, problems = [], []
+    counts = {"extracted": 0, "kept": 0, "failed": 0, "voxels": 0}
+    problems = []
     with output.progress("extract-slat") as progress:
         results = work.extract(session, extractions, preprocess=not no_preprocess)
-        for number, result in enumerate(results):
+        for number, result in enumerate(results, 1):
             if isinstance(result, InputError):
+                counts["failed"] += 1
                 problems.append(str(result))
                 output.problem(f"slatprep: {result}")
             else:
-                done.append(result)
-            progress(number + 1, len(extractions))
-    counts = {
-        "extracted": sum(not result.kept for result in done),
-        "kept": sum(result.kept for result in done),
-        "failed": len(problems),
-        "voxels": sum(result.voxels for result in done),
-    }
+                counts["kept" if result.kept else "extracted"] += 1
+                counts["voxels"] += result.voxels
+            progress(number, len(extractions))
     told = {"path": out, "model": session.model, "problems": problems}
     output.counted(f"Latents in {out}", counts, complete=not problems, **told)
 

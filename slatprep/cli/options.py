@@ -7,7 +7,7 @@ import difflib
 import math
 import pkgutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import click
 
-from slatprep.cli.output import Output
+from slatprep.cli.output import Output, new_file
 from slatprep.cli.signature import Click, NewPath
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
-    from slatprep.readers.splits import Assignment, Shares
+    from slatprep.readers.splits import Shares, Split
     from slatprep.records import Place
     from slatprep.store import Store
     from slatprep.workers.local import Workers
@@ -149,9 +149,7 @@ DrawnFile = Annotated[NewFile, Click(metavar="FILE.png|svg|pdf", callback=_drawa
 
 def draw_to(output: Output, picture: Path, draw: Callable[[str], bytes]) -> None:
     """Write the picture that `draw` gives in the format that the file's name has."""
-    from slatprep.storage.atomic import staged, writing
-
-    with writing(str(picture), picture.parent), staged(picture) as path:
+    with new_file(picture) as path:
         path.write_bytes(draw(picture.suffix[1:].lower()))
     output.note(f"picture: {picture}")
 
@@ -415,8 +413,13 @@ _FEW_OBJECTS = 100
 """Below this number a hash's shares are far from those asked for."""
 
 
-def note_split(output: Output, assignment: Assignment, how: str) -> None:
-    """Print the sizes of the splits, and ids of a file and of the store that are in none."""
+def split_of_objects(
+    output: Output, store: Store, rule: Mapping[str, Any], how: str
+) -> dict[str, Split]:
+    """Return the split of each object; print the sizes of splits, and ids that are in none."""
+    from slatprep.learn.splits import assign_store
+
+    assignment = assign_store(store, **rule)
     counts = ", ".join(f"{len(ids):,} {split}" for split, ids in assignment.lists().items())
     output.note(f"split:   {how}: {counts}")
     if how.endswith("by hash") and len(assignment.splits) < _FEW_OBJECTS:
@@ -430,6 +433,7 @@ def note_split(output: Output, assignment: Assignment, how: str) -> None:
     ):
         if ids:
             output.note(f"note:    {len(ids):,} ids {what}: {', '.join(ids[:3])[:200]} ...")
+    return assignment.splits
 
 
 def _shares(text: str) -> Shares:

@@ -159,17 +159,20 @@ class Output:
                 yield update
 
 
+@contextmanager
+def new_file(file: Path) -> Iterator[Path]:
+    """Yield a path whose content becomes that of `file`; StoreError where it cannot be written."""
+    from slatprep.storage.atomic import staged, writing
+
+    with writing(str(file), file.parent), staged(file) as path:
+        yield path
+
+
 def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a table as CSV in which no text becomes a formula in a spreadsheet."""
     import csv
 
-    from slatprep.storage.atomic import staged, writing
-
-    with (
-        writing(str(file), file.parent),
-        staged(file) as path,
-        path.open("w", encoding="utf-8", newline="") as opened,
-    ):
+    with new_file(file) as path, path.open("w", encoding="utf-8", newline="") as opened:
         csv.writer(opened).writerows([header, *(map(_for_spreadsheet, row) for row in rows)])
 
 

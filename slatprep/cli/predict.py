@@ -97,7 +97,8 @@ def predict(
     if image is not None:
         standardised = "no"  # TRELLIS samples them as its decoders take them.
     read = LatentsReader(output, image.latents if image else source, assets, space, standardised)
-    predicted, voxels, decoding, writing = 0, 0, 0.0, 0.0
+    counts = {"predicted": 0, "voxels": 0}
+    seconds = {**(image.seconds if image else {}), "read": 0.0, "decode": 0.0, "write": 0.0}
     with output.progress("predict") as progress:
         progress(0, len(read.ids))
         for number, field in enumerate(work.predict(decoder, read, batch_voxels=batch_voxels)):
@@ -107,46 +108,32 @@ def predict(
             except InputError as error:
                 read.leave_out(error)
             else:
-                predicted += 1
-                voxels += len(field.coords)
-            writing += time.perf_counter() - begin
-            decoding += field.seconds
-            progress(predicted + len(read.problems), len(read.ids))
-    counts = {"predicted": predicted, "voxels": voxels}
-    seconds = {"read": read.seconds, "decode": decoding, "write": writing}
-    if image:
-        seconds = {**image.seconds, **seconds}
-    if image and gaussians is not None and predicted:
+                counts["predicted"] += 1
+                counts["voxels"] += len(field.coords)
+            seconds["write"] += time.perf_counter() - begin
+            seconds["decode"] += field.seconds
+            progress(counts["predicted"] + len(read.problems), len(read.ids))
+    seconds["read"] = read.seconds
+    if image and gaussians is not None and counts["predicted"]:
         begin = time.perf_counter()
         _write_gaussians(output, image, out, gaussians, far)
         seconds["gaussians"] = time.perf_counter() - begin
-    document = {
-        "path": out,
-        "checkpoint": decoder.sha256,
-        "size": decoder.size,
-        **counts,
-        "seconds": seconds,
-        "problems": read.problems,
-    }
+    about = {"path": out, "checkpoint": decoder.sha256, "size": decoder.size}
 
     def show() -> None:
         output.record(f"Predictions in {out}", counts)
-        each = 1e3 / max(predicted, 1)
-        printed = SECONDS if image else {}
-        output.table(
-            "Time",
-            ("stage", "seconds", "ms an asset", *(["SLAT-Phys, s"] if image else [])),
-            [
-                (stage, spent, spent * each, *([printed.get(stage, "")] if image else []))
-                for stage, spent in {**seconds, "in all": sum(seconds.values())}.items()
-            ],
-        )
+        each = 1e3 / max(counts["predicted"], 1)
+        stages = {**seconds, "in all": sum(seconds.values())}
+        columns, shown = ("stage", "seconds", "ms an asset", "SLAT-Phys, s"), 4 if image else 3
+        rows = [(name, s, s * each, SECONDS.get(name, ""))[:shown] for name, s in stages.items()]
+        output.table("Time", columns[:shown], rows)
         if image:
             others = ", ".join(
                 f"{name} {spent:,.0f} s" for name, spent in SECONDS_OF_OTHERS.items()
             )
             output.note(f"SLAT-Phys's times are of an A5000; it prints beside them: {others}")
 
+    document = {**about, **counts, "seconds": seconds, "problems": read.problems}
     output.made(document, show, complete=not read.problems)
 
 

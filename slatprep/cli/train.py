@@ -125,7 +125,6 @@ def train(
     import torch
 
     from slatprep.learn.runs import LAST
-    from slatprep.learn.splits import assign_store
     from slatprep.learn.train import TrainParameters
     from slatprep.learn.train import train as run
     from slatprep.records import USABLE, Verdict
@@ -144,7 +143,7 @@ def train(
         training = dataclasses.replace(training, **own)
     torch.set_num_threads(threads or os.cpu_count() or 1)
     opened, rule = options.opened(store), splits.rule
-    options.note_split(output, assign_store(opened, **rule), f"by {rule['by']}")
+    options.split_of_objects(output, opened, rule, f"by {rule['by']}")
     if verdicts is None:
         verdicts = USABLE
         options.note_left_out(output, opened)

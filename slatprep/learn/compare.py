@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +37,6 @@ from slatprep.records import (
     Place,
 )
 from slatprep.sample import sample
-from slatprep.storage.atomic import staged, writing
 from slatprep.store import Store, open_store
 
 OURS = "these predictions"
@@ -87,10 +88,8 @@ def compare_methods(
     store_path: Place,
     split: Split | None = "test",
     *,
-    splits: Mapping[str, Split],
     spread: Spread = "se",
-    verdicts: Collection[str] | None = None,
-    max_ambiguity: float | None = None,
+    **filters: Any,
 ) -> Comparison:
     """Measure predictions of SLAT voxels and predicted grids against a store.
 
@@ -116,15 +115,12 @@ def compare_methods(
     scored: dict[int, list[NDArray[np.float64]]] = {}
     partly: set[str] = set()
     problems: list[str] = []
-    chosen = select_assets(
-        store, split, splits=splits, verdicts=verdicts, max_ambiguity=max_ambiguity
-    )
     with open_predictions(predictions) if predictions else nullcontext() as read:
-        for index in chosen.tolist():
+        for index in select_assets(store, split, **filters).tolist():
             object_id = str(object_ids[index])
             truth = _Truth(store, index)
             try:
-                rows = [truth.score(_ours(predictions, read, truth))] if read else []
+                rows = [score_asset(_ours(predictions, read, truth), truth.voxels)] if read else []
                 for name, root in grids.items():
                     rows += truth.score_grid(root, found[name].get(object_id, []), object_id)
             except InputError as error:
@@ -171,11 +167,6 @@ class _Truth:
         self.voxels = store.read(index, columns)
         self.grid = np.asarray(store.read_rows("grid/material", index, index + 1)[0])
 
-    def score(self, prediction: VoxelPrediction) -> NDArray[np.float64]:
-        """Return the metrics of a prediction of the SLAT's voxels."""
-        truth = (self.voxels[name] for name in ("properties", "material", "valid"))
-        return score_asset(prediction, *truth)
-
     def score_grid(
         self, root: Path, found: Sequence[FoundField], object_id: str
     ) -> Iterator[NDArray[np.float64]]:
@@ -193,20 +184,15 @@ class _Truth:
             properties=properties.astype(np.float32),
         )
         looked_up = sample(field, self.voxels["place"], self.store.about.build.parameters.sample)
-        valid = self.voxels["valid"]
-        yield self.score(
-            VoxelPrediction(
-                np.where(valid[:, None], looked_up.properties, 0.0).astype(np.float64),
-                looked_up.material.astype(np.int64),
-            )
-        )
-        stored = self.store.read_rows("grid/properties", self.index, self.index + 1)[0]
+        values = np.where(self.voxels["valid"][:, None], looked_up.properties, 0.0)
+        looked_up_classes = looked_up.material.astype(np.int64)
         yield score_asset(
-            VoxelPrediction(properties, material.astype(np.int64)),
-            np.asarray(stored)[:, annotated].T,
-            self.grid[annotated],
-            np.ones(len(properties), dtype=bool),
+            VoxelPrediction(values.astype(np.float64), looked_up_classes), self.voxels
         )
+        stored = np.asarray(self.store.read_rows("grid/properties", self.index, self.index + 1)[0])
+        own = {"properties": stored[:, annotated].T, "material": self.grid[annotated]}
+        own["valid"] = np.ones(len(properties), dtype=bool)
+        yield score_asset(VoxelPrediction(properties, material.astype(np.int64)), own)
 
 
 def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPrediction:
@@ -218,10 +204,10 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
     return check_prediction(source, arrays, coords, store.normalization, store.contents)
 
 
-def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> None:
-    """Draw a panel for each metric into a PNG, with the mean and spread of each method.
+def draw_comparison(methods: Mapping[str, Measure], what: str, form: str) -> bytes:
+    """Draw a panel for each metric, with the mean and spread of each method.
 
-    `what` says in words which kind of spread it is. StoreError if the PNG cannot be written.
+    `what` says in words which kind of spread it is, `form` is png, svg or pdf.
     """
     from matplotlib.figure import Figure
 
@@ -245,7 +231,7 @@ def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> No
                 axes.annotate(f"{mean:.3f}", (mean + spreads[place, k], place), (5, 0), va="center",
                               textcoords="offset points", fontsize=8, color=INK)  # fmt: skip
         axes.set_xlim(0, 1.35 * (1.0 if metric == "accuracy" else most))
-        axes.set_title(_TITLES.get(metric, metric), fontsize=9, color=INK)
+        axes.set_title(_TITLES[metric], fontsize=9, color=INK)
         axes.tick_params(labelsize=8, colors=MUTED, length=0)
         axes.locator_params(axis="x", nbins=4)
         axes.spines[["top", "right", "left"]].set_visible(False)
@@ -256,5 +242,6 @@ def draw_comparison(methods: Mapping[str, Measure], what: str, path: Path) -> No
         f"mean squared error in normalised space, and class accuracy; {count} objects, ± {what}",
         fontsize=8, color=MUTED,
     )  # fmt: skip
-    with writing(str(path), path.parent), staged(path) as partial:
-        figure.savefig(partial, dpi=120, format="png")
+    drawn = BytesIO()
+    figure.savefig(drawn, dpi=120, format=form)
+    return drawn.getvalue()

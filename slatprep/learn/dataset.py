@@ -254,7 +254,7 @@ class EpochSampler(Sampler[Draw]):
         return (Draw(int(index), self.epoch) for index in order[self.first :])
 
 
-class SlatLoader(DataLoader[Item]):
+class SlatLoader(DataLoader[SparseBatch]):
     """Batches of a `SlatDataset`, which do not depend on the number of workers.
 
     Parameters
@@ -295,7 +295,7 @@ class SlatLoader(DataLoader[Item]):
             dataset = SlatDataset(dataset)
         self.order = EpochSampler(len(dataset), shuffle=shuffle, seed=dataset.seed)
         super().__init__(
-            dataset,
+            dataset,  # type: ignore[arg-type]  # of items, which `collate` makes batches of
             batch_size,
             sampler=self.order,
             num_workers=workers,
@@ -303,10 +303,6 @@ class SlatLoader(DataLoader[Item]):
             multiprocessing_context=start_method if workers else None,
             pin_memory=pin_memory,
         )
-
-    def __iter__(self) -> Iterator[SparseBatch]:  # type: ignore[override]
-        """Iterate over batches: `DataLoader` itself leaves their type open."""
-        return super().__iter__()
 
     def set_epoch(self, epoch: int, batches: int = 0) -> None:
         """Set the epoch, which decides order and augmentation; leave out its first batches."""

@@ -6,9 +6,8 @@ single voxels.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +18,7 @@ from slatprep.errors import InputError
 from slatprep.geometry.frames import voxel_centres
 from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
 from slatprep.learn.splits import select_assets
-from slatprep.readers.splits import Shares, Split
+from slatprep.readers.splits import Split
 from slatprep.records import Normalization, Place
 from slatprep.store import Store, open_store
 
@@ -54,6 +53,12 @@ vlongle/pixie's ``metrics.py`` prints them."""
 
 _PIXIE_90 = 1.645
 """Standard errors in half of Pixie's 90 % interval for accuracy."""
+
+COLUMNS = ("coords", "feats", "properties", "material", "valid")
+"""The arrays of an asset that a baseline is fitted to and measured on."""
+
+Rows = Mapping[str, NDArray[Any]]
+"""Those arrays by name, as `Store.read` returns them."""
 
 
 @dataclass(frozen=True)
@@ -103,21 +108,18 @@ class Evaluation:
     baselines: dict[str, Measure] = field(default_factory=dict)
 
 
-def score_asset(
-    prediction: VoxelPrediction,
-    properties: NDArray[np.float32],
-    material: NDArray[np.uint8],
-    valid: NDArray[np.bool_],
-) -> NDArray[np.float64]:
+def score_asset(prediction: VoxelPrediction, truth: Rows) -> NDArray[np.float64]:
     """Return the metrics (P + 2,) of an asset, in the order of `metrics_of`.
 
-    They are means over its valid voxels, of which there must be one. `properties` (N, P) in [-1, 1]
-    and `material` (N,) are the truth. Accuracy is NaN if no class was predicted.
+    They are means over its valid voxels, of which there must be one. `truth` has ``properties``
+    (N, P) in [-1, 1], ``material`` (N,) and ``valid`` (N,). Accuracy is NaN if no class was
+    predicted.
     """
-    errors = np.square(prediction.properties - properties)[valid].mean(axis=0)
+    valid = truth["valid"]
+    errors = np.square(prediction.properties - truth["properties"])[valid].mean(axis=0)
     accuracy = np.nan
     if prediction.material is not None:
-        accuracy = float((prediction.material == material)[valid].mean())
+        accuracy = float((prediction.material == truth["material"])[valid].mean())
     return np.array([*errors, errors.mean(), accuracy])
 
 
@@ -184,47 +186,35 @@ def evaluate_store(
     predictions: Path,
     store_path: Place,
     split: Split | None = "test",
-    shares: Shares = Shares(),  # noqa: B008 (immutable)
     spread: Spread = "se",
-    verdicts: Collection[str] | None = None,
-    max_ambiguity: float | None = None,
-    splits: Mapping[str, Split] | None = None,
+    **filters: Any,
 ) -> Evaluation:
     """Measure predictions, as `open_predictions` reads them, against a store.
 
-    `shares` are those of the training. `slatprep.learn.splits.select_assets` takes split and
-    filters. InputError if no asset of the split has a prediction, or a prediction cannot be used.
+    `slatprep.learn.splits.select_assets` takes split and filters. InputError if no asset of the
+    split has a prediction, or a prediction cannot be used.
     """
     store = open_store(store_path)
     scored: dict[int, list[NDArray[np.float64]]] = {}
     missing: list[str] = []
     converted = 0
-    select = partial(
-        select_assets,
-        store,
-        shares=shares,
-        verdicts=verdicts,
-        max_ambiguity=max_ambiguity,
-        splits=splits,
-    )
-    chosen, trained = select(split), select("train").tolist()
+    trained = select_assets(store, "train", **filters).tolist()
     baselines = fit_baselines(store, trained) if trained else ()
     with open_predictions(predictions) as read:
-        for index in chosen.tolist():
+        for index in select_assets(store, split, **filters).tolist():
             asset_id = store.ids[index]
             arrays = read(asset_id)
             if arrays is None:
                 missing.append(asset_id)
                 continue
             rows = store.read(index, COLUMNS)
-            truth = rows["properties"], rows["material"], rows["valid"]
             source, ranges = f"{predictions}/{asset_id}", store.normalization
             prediction = check_prediction(source, arrays, rows["coords"], ranges, store.contents)
             converted += prediction.converted
             if not store.contents.classes:
                 prediction = replace(prediction, material=None)
             methods = prediction, *(one.predict(rows) for one in baselines)
-            scored[index] = [score_asset(one, *truth) for one in methods]
+            scored[index] = [score_asset(one, rows) for one in methods]
     if not scored:
         raise InputError(
             predictions,
@@ -235,13 +225,6 @@ def evaluate_store(
     (overall, groups), *others = average_methods(store, scored, ["", *names], spread).values()
     beside = {name: mean for name, (mean, _) in zip(names, others, strict=True)}
     return Evaluation(spread, overall, groups, missing, converted, beside)
-
-
-COLUMNS = ("coords", "feats", "properties", "material", "valid")
-"""The arrays of an asset that a baseline is fitted to."""
-
-Rows = Mapping[str, NDArray[Any]]
-"""Those arrays by name, as `Store.read` returns them."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import change_ranges
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
 from slatprep.readers.hdf5 import group_arrays
-from slatprep.readers.splits import Shares
+from slatprep.readers.splits import HASH, Shares
 from slatprep.records import (
     MANY_BACKGROUND,
     MAX_PROPERTIES,
@@ -97,11 +97,12 @@ class _Selection:
     max_ambiguity: Share | None
 
 
-def selection_of_run(predictions: Path) -> dict[str, Any] | None:
+def selection_of_run(predictions: Path) -> tuple[Path, dict[str, Any], dict[str, Any]] | None:
     """Return which assets the training run beside the predictions chose, None without a run.
 
-    The result holds arguments of `slatprep.learn.splits.select_assets`, and as ``by`` the file of
-    splits if there is one. InputError if the run's file lacks one of them.
+    That is the run's file, the rule of the split as arguments of
+    `slatprep.learn.splits.assign_store`, and the filters of `slatprep.learn.splits.select_assets`.
+    InputError if the file lacks one of them.
     """
     from pydantic import TypeAdapter
 
@@ -111,7 +112,7 @@ def selection_of_run(predictions: Path) -> dict[str, Any] | None:
     try:
         run = read_document(file, RUN_BYTES)
         named = {name: run[name] for name in ("shares", "verdicts", "max_ambiguity")}
-        selection = vars(TypeAdapter(_Selection).validate_python(named))
+        filters = dict(vars(TypeAdapter(_Selection).validate_python(named)))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             file,
@@ -119,7 +120,8 @@ def selection_of_run(predictions: Path) -> dict[str, Any] | None:
             "what `slatprep train` wrote; or give --split-by or --shares",
         ) from error
     lists = file.with_name(SPLITS_FILE)
-    return selection | ({"by": str(lists)} if lists.exists() else {})
+    by = str(lists) if lists.exists() else HASH
+    return file, {"by": by, "shares": filters.pop("shares")}, filters
 
 
 ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]
@@ -221,9 +223,7 @@ def _order(
     mine, stored = (np.argsort(key, kind="stable") for key in keys)
     if not np.array_equal(keys[0][mine], keys[1][stored]):
         raise InputError(source, "has other voxels than the store", "the store's voxel/coords")
-    order = np.empty_like(mine)
-    order[stored] = mine
-    return order
+    return mine[np.argsort(stored)]
 
 
 def _shaped(

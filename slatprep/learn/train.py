@@ -19,7 +19,7 @@ from slatprep.errors import ConfigError
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
-from slatprep.learn.metrics import COLUMNS, VoxelBaseline, fit_baselines, score_asset
+from slatprep.learn.metrics import COLUMNS, fit_baselines, score_asset
 from slatprep.learn.predict import (
     Checkpoint,
     checkpoint_state,
@@ -189,19 +189,15 @@ def train(
         references = {}
         if val_set is not None:
             for one in fit_baselines(opened, train_set.indices.tolist()):
-                scores = [_score(one, opened, index) for index in val_set.indices.tolist()]
-                references[one.name] = float(np.mean(scores))
+                errors = []
+                for index in val_set.indices.tolist():
+                    rows = opened.read(index, COLUMNS)
+                    errors.append(score_asset(one.predict(rows), rows)[-2])
+                references[one.name] = float(np.mean(errors))
             run.draw(session.history, references)
         predictions = run.path / "predictions"
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     return TrainSummary(session.history, session.best_epoch, references, predictions)
-
-
-def _score(baseline: VoxelBaseline, store: Store, index: int) -> float:
-    """Return the mean squared error of a baseline for an asset, the mean of its properties."""
-    rows = store.read(index, COLUMNS)
-    truth = rows["properties"], rows["material"], rows["valid"]
-    return float(score_asset(baseline.predict(rows), *truth)[-2])
 
 
 def precision_of(device: str) -> str:

@@ -19,6 +19,7 @@ from slatprep.errors import InputError, StoreError
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predictions import check_prediction, read_array, selection_of_run
 from slatprep.learn.runs import LAST
+from slatprep.learn.splits import assign_store
 from slatprep.learn.train import TrainParameters, train
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.readers.files import ArraySpec
@@ -45,7 +46,8 @@ def test_training_writes_nothing_outside(hostile, tmp_path):
     written = list(summary.predictions.iterdir())
     assert written and all(path.name.startswith(("%2E%2E%2F", "%2F", "%2E.")) for path in written)
     assert {path.name for path in tmp_path.iterdir()} == {"s.zarr", "deep"}
-    found = evaluate_store(summary.predictions, hostile, "test", SHARES)
+    splits = assign_store(open_store(hostile), shares=SHARES).splits
+    found = evaluate_store(summary.predictions, hostile, "test", splits=splits)
     assert found.missing == []
 
 
