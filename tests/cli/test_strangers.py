@@ -10,8 +10,7 @@ import pytest
 from click.testing import Result
 from support.commands import document, refused, run
 from support.made_store import edit_json, rewrite
-
-from slatprep.store import open_store
+from support.predictions import write_predictions
 
 
 @pytest.fixture
@@ -178,16 +177,12 @@ def test_a_category_with_the_space_of_all_costs_no_memory(store):
 
 
 def test_a_table_of_scores_has_no_formulas(store, tmp_path):
-    opened = open_store(store)
-    (tmp_path / "p").mkdir()
-    for row, asset_id in enumerate(opened.ids):
-        count = len(opened.read(row, ("coords",))["coords"])
-        np.savez(tmp_path / f"p/{asset_id}.npz", properties=np.zeros((count, 3)))
+    predictions = write_predictions(tmp_path / "p", store)
     for row, category in enumerate(("=cmd|x", "+1", "-1", "@a\x1b[2J", " =b")):
         rewrite(store, "asset/category", row, category)
     table = tmp_path / "scores.csv"
     words = ("--store", store, "--split", "all", "--csv", table)
-    run("evaluate", tmp_path / "p", *words, code=None)
+    run("evaluate", predictions, *words, code=None)
     with table.open(encoding="utf-8", newline="") as file:
         first = {row[0] for row in csv.reader(file)}
     # The bear's two views are one object, of the first one's category.

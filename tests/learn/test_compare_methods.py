@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.commands import refused, run
+from support.predictions import right, write_predictions
 from support.synthetic import Dataset
 
 from slatprep import InputError, open_store
@@ -165,16 +166,15 @@ def test_other_ranges_are_brought_to_the_store_s(case, make_dataset, tmp_path):
     np.testing.assert_allclose(list(found.values())[:3], np.mean(rows, axis=0), rtol=1e-5)
 
 
-def save(path: Path, array: np.ndarray) -> None:
-    np.save(path, array, allow_pickle=True)
-
-
 BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "missing": (lambda path: path.unlink(), "no grid for id 'b'"),
     "short": (lambda path: path.write_bytes(path.read_bytes()[:-8]) and None, "truncated"),
-    "shape": (lambda path: save(path, np.zeros((11, 32, 32, 32), np.float32)), "has shape"),
-    "class": (lambda path: save(path, np.full((4, 64, 64, 64), 9.0)), "unknown class 9"),
-    "two": (lambda path: save(path.with_name("sample_1_pred.npy"), np.load(path)), "2 samples"),
+    "shape": (lambda path: np.save(path, np.zeros((11, 32, 32, 32), np.float32)), "has shape"),
+    "class": (lambda path: np.save(path, np.full((4, 64, 64, 64), 9.0)), "unknown class 9"),
+    "two": (
+        lambda path: shutil.copy(path, path.with_name("sample_1_pred.npy")) and None,
+        "2 samples",
+    ),
 }
 
 
@@ -195,16 +195,7 @@ def test_a_bad_grid_is_named_and_the_rest_goes_on(case, tmp_path, fault):
 
 
 def test_side_by_side_on_the_same_objects(case, tmp_path):
-    ours = tmp_path / "ours"
-    store = open_store(case.store)
-    ours.mkdir()
-    for index, name in enumerate(store.ids):
-        stored = store.read(index, ("properties", "material"))
-        np.savez(
-            ours / f"{name}.npz",
-            properties=np.nan_to_num(stored["properties"]),
-            material=np.where(stored["material"] == 255, 0, stored["material"]),
-        )
+    ours = write_predictions(tmp_path / "ours", case.store, right)
     four = case.results.parent / "four"
     table, picture = tmp_path / "scores.csv", tmp_path / "methods.png"
     command = ("evaluate", ours, "--store", case.store, "--split", "all", "--grids",

@@ -42,24 +42,6 @@ def test_parameters_are_as_many_as_the_paper_says(size, millions):
     assert set(SIZES) >= {"small", "medium", "large"}
 
 
-def test_order_of_voxels_is_of_no_matter(model):
-    coords, feats = voxels(400, 0, extent=20)
-    order = torch.randperm(400)
-    straight, shuffled = model(coords, feats), model(coords[order], feats[order])
-    for a, b in zip(straight, shuffled, strict=True):
-        torch.testing.assert_close(a[order], b, rtol=0, atol=1e-5)
-
-
-def test_other_assets_in_the_batch_are_of_no_matter(model):
-    # The neighbour is denser, so windows are padded to other lengths.
-    coords, feats = voxels(150, 1, batch=0, extent=20)
-    other, more = voxels(3000, 2, batch=1, extent=20)
-    alone = model(coords, feats)
-    together = model(torch.cat([other, coords]), torch.cat([more, feats]))
-    for a, b in zip(alone, together, strict=True):
-        torch.testing.assert_close(a, b[3000:], rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize("shift", [0, 4])
 def test_attention_equals_a_dense_reference(shift):
     torch.manual_seed(0)

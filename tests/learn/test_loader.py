@@ -1,6 +1,7 @@
 """The loader: splits, batches, workers, symmetries."""
 
 import hashlib
+import itertools
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,6 @@ import torch
 import zarr
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.utils.data import DataLoader
 
 from slatprep import ConfigError, open_store
 from slatprep.geometry.frames import voxel_centres
@@ -55,14 +55,6 @@ def test_split_is_where_the_hash_falls(object_id, parts):
     expected = ("train", "val", "test")[int(np.searchsorted(edges, position, side="right"))]
     if np.abs(edges - position).min() > 1e-9:
         assert split_of(object_id, shares) == expected
-
-
-def test_splits_part_the_store_and_keep_views_together(learn_store):
-    store = open_store(learn_store)
-    parts = [select_assets(store, split, shares=THIRDS) for split in ("train", "val", "test")]
-    assert sorted(np.concatenate(parts).tolist()) == list(range(len(store)))
-    views = {store.find("h.front"), store.find("h.side")}
-    assert [len(views & set(part.tolist())) for part in parts].count(2) == 1
 
 
 def test_filters(learn_store):
@@ -175,22 +167,19 @@ def test_no_split_is_empty_where_there_are_as_many_objects(objects):
     assert "val" not in split_objects(objects, Shares(0.5, 0.0, 0.5)).values()
 
 
-def test_what_is_filtered_moves_no_object_to_another_split(learn_store):
+def test_splits_part_the_store_keep_views_together_and_do_not_depend_on_filters(learn_store):
     store = open_store(learn_store)
     ambiguity = np.sort(store.column("ambiguity"))
+    views = {store.find("h.front"), store.find("h.side")}
     for shares in (THIRDS, Shares(), Shares(0.02, 0.96, 0.02)):
-        for limit in (ambiguity[0], ambiguity[4]):
-            everything = {s: set(select_assets(store, s, shares=shares)) for s in SPLITS}
-            assert all(everything.values())
-            for split in SPLITS:
-                some = select_assets(store, split, shares=shares, max_ambiguity=float(limit))
-                assert set(some) <= everything[split]
-
-
-def test_a_plain_loader_takes_collate(learn_store):
-    dataset = SlatDataset(learn_store)
-    batches = list(DataLoader(dataset, batch_size=4, collate_fn=collate))
-    assert [asset for batch in batches for asset in batch.asset_ids] == dataset.asset_ids
+        whole = {s: select_assets(store, s, shares=shares).tolist() for s in SPLITS}
+        assert all(whole.values()) and sorted(itertools.chain(*whole.values())) == [
+            *range(len(store))
+        ]
+        assert [len(views & set(part)) for part in whole.values()].count(2) == 1
+        for limit, split in itertools.product((ambiguity[0], ambiguity[4]), SPLITS):
+            some = select_assets(store, split, shares=shares, max_ambiguity=float(limit))
+            assert set(some) <= set(whole[split])
 
 
 def test_voxels_that_are_not_sure_enough_are_left_out(learn_store, tmp_path):

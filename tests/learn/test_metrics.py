@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import zarr
 from support.commands import document, run
+from support.predictions import write_one
 
 from slatprep import InputError, open_store
 from slatprep.learn.metrics import METRICS, average_objects, evaluate_store, score_asset
@@ -42,30 +43,20 @@ def test_objects_count_alike_whatever_their_views():
 
 @pytest.fixture(scope="module")
 def predicted(learn_store: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Write one set of noisy predictions in each form, two with their voxels shuffled."""
+    """Write one set of noisy predictions in each form, one with its voxels shuffled."""
     folder = tmp_path_factory.mktemp("predictions")
     paths = {"npz": folder / "npz", "zarr": folder / "p.zarr", "hdf5": folder / "p.h5"}
-    paths["npz"].mkdir()
     store, rng = open_store(learn_store), np.random.default_rng(0)
-    with h5py.File(paths["hdf5"], "w") as file:
-        root = zarr.open_group(paths["zarr"], mode="w")
-        for index, asset_id in enumerate(store.ids):
-            rows = store.read(index, ("coords", "properties"))
-            count = len(rows["coords"])
-            properties = np.nan_to_num(rows["properties"]) + rng.normal(0, 0.3, (count, 3))
-            logits = rng.normal(size=(count, 8))
-            order = rng.permutation(count)
-            np.savez(
-                paths["npz"] / f"{asset_id}.npz",
-                properties=properties[order],
-                material=logits.argmax(1)[order],
-                coords=rows["coords"][order],
-            )
-            root.create_group(asset_id)
-            root[asset_id].create_array("properties", data=properties)
-            root[asset_id].create_array("logits", data=logits)
-            file[f"{asset_id}/properties"] = properties
-            file[f"{asset_id}/logits"] = logits
+    for index, asset_id in enumerate(store.ids):
+        rows = store.read(index, ("coords", "properties"))
+        count = len(rows["coords"])
+        properties = np.nan_to_num(rows["properties"]) + rng.normal(0, 0.3, (count, 3))
+        logits = rng.normal(size=(count, 8))
+        for form in ("zarr", "hdf5"):
+            write_one(paths[form], form, asset_id, {"properties": properties, "logits": logits})
+        whole = {"properties": properties, "material": logits.argmax(1), "coords": rows["coords"]}
+        order = rng.permutation(count)
+        write_one(paths["npz"], "npz", asset_id, {name: v[order] for name, v in whole.items()})
     return paths
 
 
@@ -92,22 +83,6 @@ def test_against_a_plain_computation(learn_store, predicted, form):
     assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
 
 
-def test_command(learn_store, predicted, tmp_path):
-    some = tmp_path / "some"
-    shutil.copytree(predicted["npz"], some)
-    (some / "a.npz").unlink()
-    words = ("evaluate", some, "--store", learn_store, "--split", "all")
-    told = document(*words, "--csv", tmp_path / "s.csv", code=1)
-    assert told["missing"] == ["a"]
-    assert told["overall"]["objects"] == 7
-    assert list(told["overall"]["means"]) == list(METRICS)
-    last = (tmp_path / "s.csv").read_text().splitlines()[-1].split(",")
-    assert last[:2] == ["all", "7"]
-    assert float(last[2]) == pytest.approx(told["overall"]["means"]["log10 E"])
-    shown = run(*words, code=1)
-    assert "no prediction of a" in shown.stderr and "log10 density" in shown.stdout
-
-
 def test_published_rows_agree_with_themselves():
     # The paper prints the mean of the three beside them, so a slip in copying shows.
     for score in (*PIXIE_TABLE, *SLAT_PHYS_TABLE):
@@ -115,17 +90,24 @@ def test_published_rows_agree_with_themselves():
         assert score.means["mean"] == pytest.approx(np.mean(three), abs=0.0011), score.method
 
 
-def test_table_is_printed_beside(learn_store, predicted, tmp_path):
-    own = tmp_path / "scores.csv"
-    words = ("evaluate", predicted["npz"], "--store", learn_store, "--split", "all")
-    ours = document(*words, "--csv", own)["overall"]
-    lines = run(*words, "--beside", "pixie", "--beside", own).stdout.splitlines()
+def test_command(learn_store, predicted, tmp_path):
+    some, own = Path(shutil.copytree(predicted["npz"], tmp_path / "some")), tmp_path / "scores.csv"
+    (some / "a.npz").unlink()
+    words = ("evaluate", some, "--store", learn_store, "--split", "all")
+    told = document(*words, "--csv", own, code=1)
+    means = told["overall"]["means"]
+    assert (told["missing"], told["overall"]["objects"], list(means)) == (["a"], 7, list(METRICS))
+    last = own.read_text().splitlines()[-1].split(",")
+    assert last[:2] == ["all", "7"] and float(last[2]) == pytest.approx(means["log10 E"])
+    shown = run(*words, "--beside", "pixie", "--beside", own, code=1)
+    assert "no prediction of a" in shown.stderr and "log10 density" in shown.stdout
+    lines = shown.stdout.splitlines()
     start = next(k for k, line in enumerate(lines) if "2508.17437" in line)
-    assert lines[start + 2].split()[-5:] == [f"{v:.3f}" for v in ours["means"].values()]
+    assert lines[start + 2].split()[-5:] == [f"{value:.3f}" for value in means.values()]
     assert lines[start + 3].split() == ["NeRF2Physics", "1.115", "0.997", "0.462", "0.858", "0.274"]
     assert any(f"Beside {own}" in line for line in lines)
-    last = document(*words, "--beside", own)["beside"][-1]
-    assert last["method"] == "all" and last["means"] == pytest.approx(ours["means"])
+    last = document(*words, "--beside", own, code=1)["beside"][-1]
+    assert last["method"] == "all" and last["means"] == pytest.approx(means)
 
 
 @pytest.mark.parametrize(

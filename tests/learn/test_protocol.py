@@ -4,43 +4,24 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from support.commands import refused, run
+from support.predictions import write_predictions
 
-from slatprep import ConfigError, open_store
+from slatprep import ConfigError
 from slatprep.learn.dataset import SlatDataset, SlatLoader
 from slatprep.learn.runs import BEST, LAST
-from slatprep.learn.splits import assign_store, select_assets
 from slatprep.learn.train import TrainParameters, train
-from slatprep.readers.splits import Shares, pixie_test_objects
+from slatprep.readers.splits import Shares
 
 BY_FILE = {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h.front"]}
 FAST = ("--size", "small", "--learning-rate", "0.002", "--threads", "1")
 
 
-@pytest.fixture
-def lists(tmp_path: Path) -> Path:
-    path = tmp_path / "lists.json"
-    path.write_text(json.dumps(BY_FILE | {"train": ["a", "b", "c", "nobody"]}))
-    return path
-
-
-def test_a_store_is_parted_by_each_rule(learn_store, lists):
-    store = open_store(learn_store)
-    found = assign_store(store, str(lists))
-    assert found.lists() == {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h"]}
-    assert (found.unknown, found.unlisted) == (("nobody",), ("f", "g"))
-    tested = select_assets(store, "test", splits=found.splits)
-    assert [store.ids[k] for k in tested] == ["e", "h.front", "h.side"]
-    by_pixie = assign_store(store, "pixie", Shares(1.0, 0.0, 0.0)).lists()
-    assert by_pixie["test"] == pixie_test_objects("abcdefgh") and by_pixie["val"] == []
-    assert SlatDataset(store, "val", splits=found.splits).asset_ids == ["d"]
-
-
-def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, lists, tmp_path):
-    out = tmp_path / "run"
+def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, tmp_path):
+    lists, out = tmp_path / "lists.json", tmp_path / "run"
+    lists.write_text(json.dumps(BY_FILE | {"train": ["a", "b", "c", "nobody"]}))
     command = ("train", learn_store, "--out", out, *FAST, "--epochs", "1", "--split-by", lists)
     told = run(*command).stderr
     assert "3 train, 1 val, 2 test" in told
@@ -63,11 +44,7 @@ def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, lists, tmp_p
 
 
 def test_evaluate_outside_a_run_says_which_split_it_takes(learn_store, tmp_path):
-    store = open_store(learn_store)
-    for index, asset_id in enumerate(store.ids):
-        coords = store.read(index, ("coords",))["coords"]
-        np.savez(tmp_path / f"{asset_id}.npz", properties=np.zeros(coords.shape))
-    command = ("evaluate", tmp_path, "--store", learn_store)
+    command = ("evaluate", write_predictions(tmp_path / "p", learn_store), "--store", learn_store)
     bare = run(*command).stderr
     assert "test, by hash, as no run lies beside the predictions" in bare
     assert "--split all" in bare and "--split-by" in bare
@@ -119,8 +96,9 @@ def test_the_last_weights_need_no_validation(learn_store, tmp_path):
 
 @pytest.mark.parametrize(
     ("words", "steps", "accumulate"),
-    [(("--steps", "1"), 1, 4), (("--steps", "1", "--accumulate", "2"), 1, 2), ((), 2000, 4)],
-)
+    [(("--steps", "1", "--weigh-by-confidence"), 1, 4),
+     (("--steps", "1", "--accumulate", "2"), 1, 2), ((), 2000, 4)],
+)  # fmt: skip
 def test_the_paper_s_preset_is_what_is_not_given(
     words, steps, accumulate, learn_store, tmp_path, monkeypatch
 ):
@@ -135,5 +113,6 @@ def test_the_paper_s_preset_is_what_is_not_given(
     assert "far enough" in told
     (chosen,) = asked
     assert (chosen.steps, chosen.accumulate) == (steps, accumulate)
+    assert chosen.weigh_by_confidence is ("--weigh-by-confidence" in words)
     # As the paper prints them.
     assert (chosen.size, chosen.learning_rate, chosen.keep) == ("large", 1e-4, "best")
