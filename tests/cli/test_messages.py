@@ -64,23 +64,6 @@ def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tm
 
 
 @pytest.mark.parametrize(
-    ("words", "number"),
-    [
-        (("train", "--learning-rate"), "nan"),
-        (("train", "--learning-rate"), "inf"),
-        (("train", "--max-ambiguity"), "nan"),
-        (("make-demo", "--habitual-share"), "nan"),
-    ],
-)
-def test_numbers_are_finite(words, number, store, tmp_path):
-    command, option = words
-    out = tmp_path / "out"
-    places = (out,) if command == "make-demo" else (store, "--out", out)
-    assert f"{number} is no finite number" in refused(command, *places, option, number)
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
     ("words", "code", "said"),
     [
         ("evaluate --store nothing-here", 2, "nothing-here"),
@@ -89,16 +72,26 @@ def test_numbers_are_finite(words, number, store, tmp_path):
         ("make-demo NEW --level 8", 2, "8 is not in the range"),
         ("make-demo d --assets 0", 2, "0 is not in the range"),
         ("info --colour", 2, "--colour"),
-        ("info FOLDER", 1, "is not a slatprep store"),
+        ("info FOLDER", 1, "FOLDER is not a slatprep store"),
         ("check-alignment --asset cuo --store STORE", 2, "did you mean cup?"),
         ("check-alignment --store STORE", 2, "say which assets"),
         ("report STORE --out s3://nowhere/p.html", 2, "expected a path of the local"),
+        ("subset STORE --verdict good --out memory://s.zarr", 2, "gone when the command ends"),
+        ("verify FOLDER", 1, "FOLDER is not a slatprep store"),
+        ("train STORE --out NEW --learning-rate nan", 2, "nan is no finite number"),
+        ("train STORE --out NEW --learning-rate inf", 2, "inf is no finite number"),
+        ("train STORE --out NEW --max-ambiguity nan", 2, "nan is no finite number"),
+        ("make-demo NEW --habitual-share nan", 2, "nan is no finite number"),
+        ("align --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below GRIDS"),
+        ("build-store --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below"),
     ],
 )
-def test_what_ends_a_command_is_told_as_json(words, code, said, store, tmp_path):
-    command, *rest = words.split()
+def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tmp_path):
     places = {"STORE": store, "FOLDER": tmp_path, "NEW": tmp_path / "new"}
-    rest = [str(places.get(word, word)) for word in rest]
+    places |= {"SLAT": mixed.root / "slat", "GRIDS": mixed.root / "pixieverse"}
+    for word, place in places.items():
+        words, said = words.replace(word, str(place)), said.replace(word, str(place))
+    command, *rest = words.split()
     result = run(command, "--json", *rest, code=code)
     told = json.loads(result.stdout)
     assert said in told["error"] and said in result.stderr
@@ -140,11 +133,6 @@ def test_ambiguous_means_the_same_wherever_it_is_counted(store, tmp_path):
     assert [one["asset_id"] for one in drawn["assets"]] == ["bear.side", "bear.front"]
 
 
-def test_info_and_verify_count_the_same_files(store):
-    one, other = (document(command, store)["files"] for command in ("info", "verify"))
-    assert one == other == sum(file.is_file() for file in store.rglob("*"))
-
-
 @pytest.mark.parametrize(
     ("place", "named"),
     [
@@ -162,18 +150,6 @@ def test_advice_names_the_store_and_not_a_version_that_is_removed_later(
     advice = {line.partition(":")[0]: line.split()[1:] for line in lines if " slatprep " in line}
     assert advice["why"] == ["slatprep", "list", named, "--verdict", "doubtful"]
     assert advice["look"] == ["slatprep", "check-alignment", "--ambiguous", "--store", named]
-
-
-@pytest.mark.parametrize("command", ["build-store", "align"])
-def test_swapped_roots_are_recognised(command, mixed, tmp_path):
-    words = (command, "--pixieverse", mixed.root / "slat", "--slat", mixed.root / "pixieverse")
-    told = refused(*words, "--out", tmp_path / "out.zarr")
-    assert f"the roots are swapped: grids lie below {mixed.root}/pixieverse" in told
-
-
-def test_a_folder_that_is_no_store_is_called_so_by_every_command(tmp_path):
-    for command in ("info", "list", "verify", "report", "describe"):
-        assert f"{tmp_path} is not a slatprep store" in refused(command, tmp_path, code=1)
 
 
 def test_quiet_commands_that_make_something_print_nothing(store, tmp_path):
@@ -202,12 +178,15 @@ def test_sources_of_a_joined_store_are_said_to_lie_apart(store, mixed, tmp_path)
     assert f"its sources are not at {pixieverse} any more; name the roots" in moved
 
 
-@pytest.mark.parametrize("command", ["info", "list", "verify", "stats", "check-alignment"])
-def test_documents_begin_alike_and_say_which_store(command, store):
-    words = ("--worst", "1", "--picture", "none", "--store") if command == "check-alignment" else ()
-    told = document(command, *words, store)
-    assert list(told)[:3] == ["command", "version", "ok"]
-    assert (told["command"], told["ok"], told["store"]) == (command, True, str(store))
+def test_documents_begin_alike_and_say_which_store(store):
+    told = {name: document(name, store) for name in ("info", "list", "verify", "stats")}
+    words = ("--worst", "1", "--picture", "none", "--store", store)
+    told["check-alignment"] = document("check-alignment", *words)
+    for command, one in told.items():
+        assert list(one)[:3] == ["command", "version", "ok"]
+        assert (one["command"], one["ok"], one["store"]) == (command, True, str(store))
+    files = sum(file.is_file() for file in store.rglob("*"))
+    assert told["info"]["files"] == told["verify"]["files"] == files
 
 
 def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(store, tmp_path):
@@ -220,11 +199,6 @@ def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(store, tmp_path
     assert done.returncode == 1
     assert "zarr.json: may not be read (Permission denied)" in done.stderr
     assert "is not a slatprep store" not in done.stderr
-
-
-def test_nothing_is_written_to_memory_that_goes_with_the_command(store):
-    told = refused("subset", store, "--verdict", "good", "--out", "memory://s.zarr")
-    assert "gone when the command ends" in told
 
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monkeypatch):
@@ -269,20 +243,11 @@ def test_a_full_disk_is_a_line(store, tmp_path, monkeypatch, words):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("make-demo", NOWHERE, "--assets", 1),
-        ("report", "STORE", "--out", NOWHERE / "r.html"),
-        ("describe", "STORE", "--out", NOWHERE / "d.json"),
-        ("train", "STORE", "--out", NOWHERE, "--epochs", 1, "--size", "small"),
-    ],
-)
-def test_a_folder_that_takes_nothing_is_a_line(words, store):
-    if words[0] == "train":
-        pytest.importorskip("torch")
-    told = refused(*(store if word == "STORE" else word for word in words), code=1)
-    assert "cannot be written to" in told
+def test_a_folder_that_takes_nothing_is_a_line(store):
+    pytest.importorskip("torch")
+    train = ("train", store, "--out", NOWHERE, "--epochs", 1, "--size", "small")
+    for words in (("make-demo", NOWHERE, "--assets", 1), train):
+        assert "cannot be written to" in refused(*words, code=1)
 
 
 # -- where `verify` looks for records -------------------------------------------

@@ -11,22 +11,16 @@ from support.commands import document, run
 
 from slatprep import StoreError, open_store
 from slatprep.cli import output as module
-from slatprep.cli.output import Output, as_json
+from slatprep.cli.output import Output
 from slatprep.inspect.overview import list_assets
 from slatprep.records import PropertyRange, Verdict
 from slatprep.store.records import StoredRecords
 
 
-class Terminal(io.StringIO):
-    """A stream that says it is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
-
-
-def a_terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+def a_terminal(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     """Print to a terminal of many colours from now on."""
-    stream = Terminal()
+    stream = io.StringIO()
+    stream.isatty = lambda: True  # type: ignore[method-assign]
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setattr(sys, "stdout", stream)
@@ -34,11 +28,9 @@ def a_terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     return stream
 
 
-ROWS = [("spot", 3, 0.98765, None), ("bunny [bold]", 12345, float("nan"), True)]
-
-
 def test_plain_table_is_aligned_and_has_no_ornament(capsys):
-    Output().table("Assets", ("name", "voxels", "fitness", "right"), ROWS)
+    rows = [("spot", 3, 0.98765, None), ("bunny [bold]", 12345, float("nan"), True)]
+    Output().table("Assets", ("name", "voxels", "fitness", "right"), rows)
     assert capsys.readouterr().out.splitlines() == [
         "Assets",
         "name          voxels  fitness  right",
@@ -48,63 +40,22 @@ def test_plain_table_is_aligned_and_has_no_ornament(capsys):
     ]
 
 
-def test_table_on_a_terminal_is_drawn_and_keeps_square_brackets(monkeypatch):
-    terminal = a_terminal(monkeypatch)
-    Output().table("Assets", ("name", "voxels", "fitness", "right"), ROWS)
-    text = terminal.getvalue()
-    assert "bunny [bold]" in text
-    assert "─" in text and "\x1b[" in text
+def test_a_terminal_gets_tables_that_are_drawn_and_cut_no_id_and_no_number(monkeypatch):
+    asset_id, green = "0123456789abcdef0123456789abcdef", "\x1b[32m"
+    for width, no_color in ((80, ""), (30, ""), (80, "1")):
+        terminal = a_terminal(monkeypatch)
+        monkeypatch.setenv("COLUMNS", str(width))
+        monkeypatch.setenv("NO_COLOR", no_color)
+        rows = [(asset_id, 12345, "good"), ("bunny [bold]", 3, "failed")]
+        Output().table("Assets", ("asset", "voxels", "verdict"), rows)
+        text = terminal.getvalue()
+        assert all(word in text for word in (asset_id, "12,345", "bunny [bold]", "─", "good"))
+        assert (green in text) is not no_color
 
 
-def test_narrow_terminal_cuts_no_id_and_no_number(monkeypatch):
-    terminal = a_terminal(monkeypatch)
-    monkeypatch.setenv("COLUMNS", "30")
-    asset_id = "0123456789abcdef0123456789abcdef"
-    Output().table("Assets", ("asset", "voxels"), [(asset_id, 12345)])
-    assert asset_id in terminal.getvalue() and "12,345" in terminal.getvalue()
-
-
-@pytest.mark.parametrize("no_color", [False, True])
-def test_verdicts_are_coloured_unless_no_color_says_otherwise(monkeypatch, no_color):
-    terminal = a_terminal(monkeypatch)
-    if no_color:
-        monkeypatch.setenv("NO_COLOR", "1")
-    Output().table("Assets", ("name", "verdict"), [("spot", "good")])
-    green = "\x1b[32m"
-    assert "good" in terminal.getvalue()
-    assert (green in terminal.getvalue()) is not no_color
-
-
-def test_json_is_the_only_thing_on_standard_output(capsys):
+def test_json_is_the_only_thing_on_standard_output_and_holds_all_that_results_do(capsys, tmp_path):
     printer = Output(as_json=True, command="look")
     printer.note("a note")
-    printer.result({"value": float("nan"), "pair": (1, 2)}, lambda: pytest.fail("not for people"))
-    captured = capsys.readouterr()
-    assert json.loads(captured.out) == {
-        "command": "look",
-        "version": version("slatprep"),
-        "ok": True,
-        "value": None,
-        "pair": [1, 2],
-    }
-    assert captured.err == "a note\n"
-
-
-def test_verbosity(capsys):
-    for verbosity in (-1, 0, 1):
-        printer = Output(verbosity=verbosity)
-        printer.note(f"note {verbosity}")
-        printer.problem(f"problem {verbosity}")
-    assert capsys.readouterr().err.split("\n")[:-1] == [
-        "problem -1",
-        "note 0",
-        "problem 0",
-        "note 1",
-        "problem 1",
-    ]
-
-
-def test_json_holds_all_that_results_do(tmp_path):
     document = {
         "a": np.float32(0.5),
         "b": np.arange(2),
@@ -112,46 +63,51 @@ def test_json_holds_all_that_results_do(tmp_path):
         "e": PropertyRange("density", True, 1.0, float("nan")),
         "f": tmp_path,
     }
-    assert json.loads(as_json(document)) == {
+    printer.result(document, lambda: pytest.fail("not for people"))
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {
+        "command": "look",
+        "version": version("slatprep"),
+        "ok": True,
         "a": 0.5,
         "b": [0, 1],
         "3": {"c": None, "d": ["good", True]},
         "e": {"name": "density", "log10": True, "lo": 1.0, "hi": None},
         "f": str(tmp_path),
     }
+    assert captured.err == "a note\n"
     with pytest.raises(TypeError, match="object"):
-        as_json({"g": object()})
+        printer.result({"g": object()}, lambda: None)
 
 
-def test_time_left_in_a_log_comes_from_all_assets_done(capsys, monkeypatch):
-    clock = iter([0.0, 10.0, 60.0, 61.0, 120.0])
-    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
-    with Output().progress("build") as update:
-        update(1, 100)
-        update(6, 100)
-        update(7, 100)
-        update(50, 100)
-    assert capsys.readouterr().err.splitlines() == [
-        "build: 6 of 100 assets, 15:40 left",
-        "build: 50 of 100 assets, 2:00 left",
-    ]
+def test_verbosity(capsys):
+    for verbosity in (-1, 0, 1):
+        printer = Output(verbosity=verbosity)
+        printer.note(f"note {verbosity}")
+        printer.problem(f"problem {verbosity}")
+    told = ["problem -1", "note 0", "problem 0", "note 1", "problem 1"]
+    assert capsys.readouterr().err.splitlines() == told
 
 
-def test_no_time_is_told_from_one_asset_or_from_what_came_before_the_first(capsys, monkeypatch):
-    clock = iter([0.0, 3600.0, 3640.0, 3680.0])
-    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
-    with Output().progress("train", "steps") as update:
-        update(0, 100)
-        update(1, 100)
-        update(2, 100)
-    assert capsys.readouterr().err.splitlines() == ["train: 2 of 100 steps, 1:05:20 left"]
-
-
-def test_quiet_shows_no_progress(capsys, monkeypatch):
-    monkeypatch.setattr(module.time, "monotonic", iter(range(0, 1000, 100)).__next__)
-    with Output(verbosity=-1).progress("build") as update:
-        update(1, 2)
-    assert capsys.readouterr().err == ""
+@pytest.mark.parametrize(
+    ("times", "updates", "told"),
+    [
+        # From all assets done.
+        ((0, 10, 60, 61, 120), ((1, 100), (6, 100), (7, 100), (50, 100)),
+         ["6 of 100 assets, 15:40 left", "50 of 100 assets, 2:00 left"]),
+        # Neither from one asset nor from what came before the first.
+        ((0, 3600, 3640, 3680), ((0, 100), (1, 100), (2, 100)),
+         ["2 of 100 assets, 1:05:20 left"]),
+    ],
+)  # fmt: skip
+def test_time_left_in_a_log(capsys, monkeypatch, times, updates, told):
+    for verbosity in (0, -1):
+        monkeypatch.setattr(module.time, "monotonic", map(float, times).__next__)
+        with Output(verbosity=verbosity).progress("build") as update:
+            for done, total in updates:
+                update(done, total)
+        shown = capsys.readouterr().err.splitlines()
+        assert shown == [f"build: {line}" for line in told if verbosity == 0]
 
 
 @pytest.mark.parametrize("done", [None, 0, 1, 3])

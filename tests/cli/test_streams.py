@@ -21,9 +21,8 @@ def shell(words: str, redirected: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     ("words", "redirected"),
-    [("info {}", ">&-"), ("list {}", "> /dev/full"),
-     ("verify {} --json", ">&-"), ("verify {} --json", "> /dev/full")],
-)  # fmt: skip
+    [("info {}", ">&-"), ("list {} --json", "> /dev/full")],
+)
 def test_lost_output_is_told_on_standard_error(mixed_build, words, redirected):
     if "full" in redirected and not DEVICE.exists():
         pytest.skip("no /dev/full")
@@ -34,7 +33,7 @@ def test_lost_output_is_told_on_standard_error(mixed_build, words, redirected):
     assert "Traceback" not in done.stderr and "Exception" not in done.stderr
 
 
-@pytest.mark.parametrize("redirected", ["2>&-", "2> /dev/full", ">&- 2>&-"])
+@pytest.mark.parametrize("redirected", ["2> /dev/full", ">&- 2>&-"])
 def test_a_subset_is_whole_whatever_happens_to_what_it_prints(mixed_build, tmp_path, redirected):
     out = tmp_path / "s.zarr"
     done = shell(f"subset {mixed_build.store} --verdict good --out {out}", redirected)
@@ -50,8 +49,8 @@ def test_lost_notes_are_told_on_standard_output_and_never_within_json(mixed_buil
     done = shell(f"verify {store}", "2>&-")  # It notes how many files it read.
     assert done.returncode == 3
     assert "standard error cannot be written to" in done.stdout
-    done = shell(f"stats {store} --json", "2>&-")
-    assert json.loads(done.stdout)["command"] == "stats"
+    done = shell(f"verify {store} --json", "2>&-")
+    assert json.loads(done.stdout)["command"] == "verify"
 
 
 def test_a_reader_that_has_read_enough_is_no_fault(mixed_build):
