@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import importlib
+import pkgutil
 import sys
 from typing import Any, NoReturn
 
@@ -59,6 +59,11 @@ runs.
 COMMANDS = {name: where for group in GROUPS.values() for name, where in group.items()}
 
 
+def _loaded(name: str) -> click.Command:
+    command: click.Command = pkgutil.resolve_name(COMMANDS[name])
+    return command
+
+
 class LazyGroup(click.Group):
     """A group that imports a command when it is used, and prints errors in one line."""
 
@@ -68,25 +73,18 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import the command of that name."""
-        if cmd_name not in COMMANDS:
-            return None
-        module, _, attribute = COMMANDS[cmd_name].partition(":")
-        command: click.Command = getattr(importlib.import_module(module), attribute)
-        return command
+        return _loaded(cmd_name) if cmd_name in COMMANDS else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write what each command does, in as many lines as that takes: click cuts it to one."""
         widest = max(map(len, COMMANDS))
         for group, names in GROUPS.items():
-            commands = ((name, self.get_command(ctx, name)) for name in names)
+            told = [
+                (name.ljust(widest), _loaded(name).get_short_help_str(limit=1_000))
+                for name in names
+            ]
             with formatter.section(group):
-                formatter.write_dl(
-                    [
-                        (name.ljust(widest), one.get_short_help_str(limit=1_000))
-                        for name, one in commands
-                        if one
-                    ]
-                )
+                formatter.write_dl(told)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

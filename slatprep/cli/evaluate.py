@@ -16,7 +16,7 @@ from slatprep.cli.signature import Click, command
 
 if TYPE_CHECKING:
     from slatprep.learn.compare import Comparison
-    from slatprep.learn.metrics import Evaluation, Measure
+    from slatprep.learn.metrics import Evaluation, Measure, Measures
     from slatprep.learn.published import PublishedScore
     from slatprep.records import Place
 
@@ -73,7 +73,7 @@ def evaluate(
     slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
     slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
     """
-    from slatprep.learn.metrics import SPREADS, evaluate_store
+    from slatprep.learn.metrics import OURS, SPREADS, evaluate_store
     from slatprep.learn.published import TABLES, read_scores
 
     if predictions is None and not grids:
@@ -89,7 +89,7 @@ def evaluate(
     chosen = _selection(output, predictions, store, split, splits) | {"spread": spread}
     part = None if split == "all" else split
     result: Evaluation | Comparison
-    baselines: dict[str, Measure] = {}
+    baselines: Measures = {}
     if grids:
         from slatprep.learn.compare import compare_methods
 
@@ -110,7 +110,7 @@ def evaluate(
         result = evaluate_store(cast("Path", predictions), store, part, **chosen)
         measures = {name or "(none)": m for name, m in result.categories.items()}
         measures |= {"all": result.overall}
-        ours, what = {"these predictions": result.overall}, "category"
+        ours, what = {OURS: result.overall}, "category"
         baselines = result.baselines
         problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
         if result.converted:

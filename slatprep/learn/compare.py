@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.geometry.voxels import voxels_of
-from slatprep.learn.metrics import METRICS, Measure, Spread, average_methods, score_asset
+from slatprep.learn.metrics import METRICS, OURS, Measures, Spread, average_methods, score_asset
 from slatprep.learn.predictions import (
     ReadAsset,
     VoxelPrediction,
@@ -38,9 +38,6 @@ from slatprep.records import (
 )
 from slatprep.sample import sample
 from slatprep.store import Store, open_store
-
-OURS = "these predictions"
-"""Name of the method whose predictions are for SLAT voxels."""
 
 _BARS = "#AFC3DC"
 
@@ -76,8 +73,8 @@ class Comparison:
     """
 
     spread: Spread
-    methods: dict[str, Measure]
-    categories: dict[str, dict[str, Measure]]
+    methods: Measures
+    categories: dict[str, Measures]
     partly_annotated: int
     problems: list[str]
 
@@ -136,17 +133,7 @@ def compare_methods(
             f"({problems[0] if problems else 'the split is empty'})",
             "predictions of the same objects",
         )
-    measured = average_methods(store, scored, names, spread)
-    return Comparison(
-        spread,
-        {name: overall for name, (overall, _) in measured.items()},
-        {
-            category: {name: groups[category] for name, (_, groups) in measured.items()}
-            for category in next(iter(measured.values()))[1]
-        },
-        len(partly),
-        problems,
-    )
+    return Comparison(spread, *average_methods(store, scored, names, spread), len(partly), problems)
 
 
 def _require_pixieverse(store: Store) -> None:
@@ -204,7 +191,7 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
     return check_prediction(source, arrays, coords, store.normalization, store.contents)
 
 
-def draw_comparison(methods: Mapping[str, Measure], what: str, form: str) -> bytes:
+def draw_comparison(methods: Measures, what: str, form: str) -> bytes:
     """Draw a panel for each metric, with the mean and spread of each method.
 
     `what` says in words which kind of spread it is, `form` is png, svg or pdf.

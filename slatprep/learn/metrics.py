@@ -28,6 +28,9 @@ METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
 The names are the columns of tables and CSV files.
 """
 
+OURS = "these predictions"
+"""Name of the method whose predictions are for SLAT voxels."""
+
 _SHORT = {"youngs_modulus": "E", "poissons_ratio": "nu"}
 
 
@@ -140,26 +143,8 @@ def measure(scores: NDArray[np.float64], spread: Spread, names: Sequence[str] = 
     return Measure(count, means, spreads)
 
 
-def average_objects(
-    scores: Sequence[NDArray[np.float64]],
-    objects: Sequence[str],
-    categories: Sequence[str],
-    spread: Spread,
-    names: Sequence[str] = METRICS,
-) -> tuple[Measure, dict[str, Measure]]:
-    """Average assets per object, then objects, over all and per category.
-
-    `scores` has the metrics (metrics,) of each asset. The views of an object count as one object.
-    """
-    _, first, number = np.unique(objects, return_index=True, return_inverse=True)
-    rows = np.array(scores)
-    per_object = np.array([rows[number == k].mean(axis=0) for k in range(len(first))])
-    category = np.array(categories)[first]
-    groups = {
-        str(name): measure(per_object[category == name], spread, names)
-        for name in np.unique(category)
-    }
-    return measure(per_object, spread, names), groups
+Measures = dict[str, Measure]
+"""Scores by the name of a method."""
 
 
 def average_methods(
@@ -167,19 +152,27 @@ def average_methods(
     scored: Mapping[int, Sequence[NDArray[np.float64]]],
     methods: Sequence[str],
     spread: Spread,
-) -> dict[str, tuple[Measure, dict[str, Measure]]]:
-    """Average the metrics of several methods as `average_objects`; `scored` has them by asset."""
+) -> tuple[Measures, dict[str, Measures]]:
+    """Average the metrics of methods over assets per object, then over objects.
+
+    `scored` has the metrics (metrics,) of each method by asset. The views of an object count as one
+    object. Returned are the measures over all objects, and those by category.
+    """
     objects, categories = (
-        [str(column[index]) for index in scored]
+        np.array([str(column[index]) for index in scored])
         for column in (store.column("object_id"), store.column("category"))
     )
-    names = metrics_of(store.normalization)
-    return {
-        method: average_objects(
-            [rows[k] for rows in scored.values()], objects, categories, spread, names
-        )
-        for k, method in enumerate(methods)
-    }
+    _, first, number = np.unique(objects, return_index=True, return_inverse=True)
+    rows = np.array(list(scored.values()))
+    per_object = np.array([rows[number == k].mean(axis=0) for k in range(len(first))])
+    category, names = categories[first], metrics_of(store.normalization)
+
+    def measures(chosen: NDArray[np.bool_]) -> Measures:
+        own = per_object[chosen]
+        return {name: measure(own[:, k], spread, names) for k, name in enumerate(methods)}
+
+    groups = {str(name): measures(category == name) for name in np.unique(category)}
+    return measures(np.ones(len(first), dtype=bool)), groups
 
 
 def evaluate_store(
@@ -221,10 +214,10 @@ def evaluate_store(
             f"has no prediction of an asset of split {split or 'all'}",
             f"ids of that split, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
         )
-    names = [one.name for one in baselines]
-    (overall, groups), *others = average_methods(store, scored, ["", *names], spread).values()
-    beside = {name: mean for name, (mean, _) in zip(names, others, strict=True)}
-    return Evaluation(spread, overall, groups, missing, converted, beside)
+    names = [OURS, *(one.name for one in baselines)]
+    beside, groups = average_methods(store, scored, names, spread)
+    overall, categories = beside.pop(OURS), {name: own[OURS] for name, own in groups.items()}
+    return Evaluation(spread, overall, categories, missing, converted, beside)
 
 
 @dataclass(frozen=True)

@@ -183,14 +183,11 @@ def test_store_built_last_is_the_default(demo, monkeypatch):
     assert "make align" in refused("info")
     (elsewhere / "data" / "demo.zarr").symlink_to(demo / "demo.zarr")
     run("info", "--json")
-    run("check-alignment", "--asset", ids_of(demo / "demo.zarr")[0], "--picture", "none")
-
-
-def test_an_alignment_is_checked_in_the_store_that_either_way_names(demo):
-    store, words = demo / "demo.zarr", ("--asset", "0", "--picture", "none", "--json")
-    one = run("check-alignment", store, *words)
-    assert run("check-alignment", "--store", store, *words).stdout == one.stdout
-    both = refused("check-alignment", store, "--store", store, *words)
+    words = ("check-alignment", "--asset", "0", "--picture", "none", "--json")
+    last, store = run(*words).stdout, demo / "demo.zarr"
+    assert run(*words, store).stdout == run(*words, "--store", store).stdout
+    assert json.loads(last)["assets"] == document(*words[:-1], store)["assets"]
+    both = refused(*words, store, "--store", store)
     assert "STORE and --store both name the store" in both
 
 

@@ -80,22 +80,6 @@ def test_function_gets_defaults_and_what_is_given():
     assert got(*words.split()) == ["x", ["y", "z"], 2, "b", ["m", "n"], True, group, 4]
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("x", "Missing option '--wanted'"),
-        ("--wanted 1", "Missing argument 'SOURCE'"),
-        ("x --wanted 1 --few 4", "4 is not in the range 1<=x<=3"),
-        ("x --wanted 1 --kind c", "'c' is not one of 'a', 'b'"),
-        ("x --wanted 1 --names n", "No such option"),
-    ],
-)
-def test_wrong_use_is_refused(words, told):
-    done = CliRunner().invoke(probe, words.split())
-    assert done.exit_code == 2
-    assert told in done.output
-
-
 def test_help_has_texts_defaults_and_sections():
     text = CliRunner().invoke(probe, ["--help"], terminal_width=90).output
     for words in ("[TARGETS]...", "Which.", "Called; may", "[required]", "Print what the function",

@@ -17,8 +17,8 @@ from support.predictions import right, write_predictions
 from support.synthetic import Dataset
 
 from slatprep import InputError, open_store
-from slatprep.learn.compare import OURS, Comparison, compare_methods
-from slatprep.learn.metrics import METRICS, SPREADS, measure
+from slatprep.learn.compare import Comparison, compare_methods
+from slatprep.learn.metrics import METRICS, OURS, SPREADS, measure
 from slatprep.learn.published import SLAT_PHYS_TABLE
 from slatprep.learn.splits import assign_store
 from slatprep.parameters import NormalizeParameters, SampleParameters

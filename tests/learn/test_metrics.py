@@ -2,6 +2,8 @@
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
@@ -11,9 +13,10 @@ from support.commands import document, run
 from support.predictions import write_one
 
 from slatprep import InputError, open_store
-from slatprep.learn.metrics import METRICS, average_objects, evaluate_store, score_asset
+from slatprep.learn.metrics import METRICS, average_methods, evaluate_store, score_asset
 from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
+from slatprep.normalize import PIXIE_RANGES
 
 
 def test_one_asset_by_hand():
@@ -32,7 +35,12 @@ def test_one_asset_by_hand():
 
 def test_objects_count_alike_whatever_their_views():
     scores = [np.full(5, value) for value in (0.0, 2.0, 4.0)]
-    overall, groups = average_objects(scores, ["a", "a", "b"], ["x", "x", "y"], "sd")
+    columns: dict[str, list[str]] = {"object_id": ["a", "a", "b"], "category": ["x", "x", "y"]}
+    store: Any = SimpleNamespace(column=columns.get, normalization=PIXIE_RANGES)
+    scored = {row: [own, own + 1] for row, own in enumerate(scores)}
+    measured, by_category = average_methods(store, scored, ["m", "other"], "sd")
+    overall, groups = measured["m"], {name: own["m"] for name, own in by_category.items()}
+    assert measured["other"].means["nu"] == 3.5
     # a is (0 + 2) / 2 = 1, b is 4: mean 2.5, sample deviation 3 / sqrt(2).
     assert overall.objects == 2
     assert overall.means["nu"] == 2.5
