@@ -59,7 +59,8 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
         return [best, *_told_apart(pair, deformed, near, fits), *far], deformed
     few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
     contested = [(best, deformed), *(_deformed(pair, pose, rough) for pose in few)]
-    ranks = np.array([rank_of(pose.similarity, bent.figures) for pose, bent in contested])
+    alike = _as_free(pair, [bent for _, bent in contested])
+    ranks = np.array([rank_of(fit.pose, fit.figures) for fit in alike])
     standing = RANK_STANDING * (np.arange(len(ranks)) == 0)
     order = np.argsort(-(ranks + standing), kind="stable")
     highest = max(pose.merit for pose, _ in contested)
@@ -71,9 +72,29 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
         if far_from_all(places, (there for _, _, there in kept)):
             below = max(float(ranks[order[0]] - ranks[k]), 0.0)
             bonus = highest - below - pose.score
-            kept.append((replace(pose, bonus=bonus, standing=0.0), bent, places))
-    (best, *near), (deformed, *fits), _ = zip(*kept, strict=True)
-    return [best, *_told_apart(pair, deformed, near, fits), *rest], deformed
+            kept.append((replace(pose, bonus=bonus, standing=0.0), alike[k], places))
+    (best, *near), (free, *fits), _ = zip(*kept, strict=True)
+    deformed = contested[order[0]][1]
+    return [best, *_told_apart(pair, free, near, fits), *rest], deformed
+
+
+def _as_free(pair: Pair, fits: Sequence[Deformed]) -> list[Deformed]:
+    """Return fits with the freedom that the freest of them has earned.
+
+    What may bend fits better anywhere, so two placements are held against each other alike.
+    """
+    models = {fit.model for fit in fits}
+    if not models & {Model.AFFINE, Model.DEFORMABLE}:
+        return list(fits)
+    bends = Model.DEFORMABLE in models
+    freest = Model.DEFORMABLE if bends else Model.AFFINE
+    free = replace(pair.parameters, model="deformable" if bends else "affine")
+    return [
+        fit
+        if fit.model is freest
+        else deform_if_earned(pair.slat, pair.pixie, fit.pose, fit.model, free)
+        for fit in fits
+    ]
 
 
 def _told_apart(

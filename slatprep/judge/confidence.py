@@ -87,5 +87,9 @@ def class_confidence(
     `confidence` is the asset's: `same_object` times `right_placement`. Placements that fit equally
     well are taken as equally likely: the model's probability counts for those with the same class.
     """
-    likely = VOXEL.probability(voxel_figures(around, confidence)) * (1.0 - around.tied)
-    return np.where(valid, likely, 0.0).astype(np.float32)
+    likely = np.zeros(len(valid), dtype=np.float32)
+    if valid.any():
+        # What has no counterpart says nothing of the others, though it is far from everything.
+        seen = around.where(valid)
+        likely[valid] = VOXEL.probability(voxel_figures(seen, confidence)) * (1.0 - seen.tied)
+    return likely

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +113,10 @@ class Surroundings:
         """Share of annotated cells two voxels away, less the half that a surface has."""
         depth: NDArray[np.float32] = self.solid[:, 1] - np.float32(0.5)
         return depth
+
+    def where(self, chosen: NDArray[np.bool_]) -> Surroundings:
+        """Return what lies around the chosen ones (N,) of the places."""
+        return Surroundings(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def surroundings_of(

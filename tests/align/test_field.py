@@ -269,9 +269,10 @@ def test_the_libraries_that_make_the_numbers_are_named():
     assert any("open3d" in name for name in engine_versions(AlignParameters(engine="open3d")))
 
 
-def _house(sills: int, seed: int) -> np.ndarray:
+def _house(sills: int, seed: int, lumps: int = 40, bend: float = 0.0) -> np.ndarray:
     """Return a house that but for its sills is its own half-turn, with lumps as the seed says."""
     x, y, z = (GRID - 31.5).transpose(3, 0, 1, 2)
+    y = y + bend * np.sin(x / 7.0 + z / 9.0)
     walls = (abs(x) < 14) & (abs(y) < 20) & (z > -16) & (z < 6)
     roof = (abs(y) < 21) & (z >= 6) & (abs(x) < 16 - (z - 6))
     solid = walls | roof
@@ -280,7 +281,7 @@ def _house(sills: int, seed: int) -> np.ndarray:
         solid |= (x >= 14) & (x < 16) & (abs(y - across) < 2) & (abs(z - up) < 1)
     rng = np.random.default_rng(seed)
     shell = voxels_of(boundary(solid))
-    for lump in shell[rng.choice(len(shell), 40, replace=False)]:
+    for lump in shell[rng.choice(len(shell), lumps, replace=False)]:
         solid |= (abs(GRID - lump) <= 1).all(axis=-1)
     return solid
 
@@ -302,3 +303,15 @@ def test_a_half_turn_ties_unless_it_fits_clearly_worse_on_the_same_samples(
         assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) == pytest.approx(180.0, abs=2.0)
     if not ties:
         assert displacement(alignment.transform, np.eye(4), latents.centres) < 1.0
+
+
+@pytest.mark.parametrize(("bend", "lumps", "seed"), [(1.5, 80, 2), (4.0, 40, 4)])
+def test_placements_are_held_against_each_other_with_the_same_freedom(
+    bend: float, lumps: int, seed: int
+) -> None:
+    """Of two placements that are as good, one just earns a deformation and the other does not."""
+    latents = surface_latents(_house(0, seed, lumps, bend))
+    alignment = align(field_of(_house(0, seed + 1, lumps)), latents, DEFAULT)
+    assert alignment.deformation is not None
+    assert alignment.margin < 0.01
+    assert len(alignment.placements) == 1

@@ -336,7 +336,18 @@ def test_figures_of_a_voxel_by_hand() -> None:
     whole = class_confidence(free, 0.8, np.array([True, True]))
     less = class_confidence(around, 0.8, np.array([True, True]))
     np.testing.assert_allclose(less, whole * [1.0, 0.75], rtol=1e-6)
-    assert class_confidence(around, 0.8, np.array([False, True])).tolist() == [0.0, less[1]]
+
+
+def test_voxels_without_a_counterpart_change_no_other_voxels_confidence() -> None:
+    one = {name: values[:1] * 0 for name, values in vars(AROUND).items()}
+    far = one | {"distance": np.array([40], np.float32), "moved": np.array([9], np.float32)}
+    both = Surroundings(
+        **{name: np.concatenate([v, far[name]]) for name, v in vars(AROUND).items()}
+    )
+    valid = np.arange(len(both.distance)) < len(AROUND.distance)
+    alone = class_confidence(AROUND, 0.8, np.ones(len(AROUND.distance), dtype=bool))
+    assert class_confidence(both, 0.8, valid).tolist() == [*alone.tolist(), 0.0]
+    assert class_confidence(both, 0.8, np.zeros_like(valid)).tolist() == [0.0] * len(valid)
 
 
 @pytest.mark.parametrize("certain", [0.0, 1.0])
