@@ -109,18 +109,11 @@ def error_rates(
     good_decoys: NDArray[np.bool_],
     seed: int = 0,
 ) -> ErrorRates:
-    """Count the errors of a dataset by its decoys.
+    """Count the errors of a dataset by its decoys, of the `FIGURES` of each, (T, F) and (D, F).
 
-    Parameters
-    ----------
-    targets, decoys : ndarray of float64, shape (T, F) and (D, F)
-        `slatprep.judge.evidence.FIGURES` of each.
-    target_folds, decoy_folds : ndarray of int, shape (T,) and (D,)
-        Which of `FOLDS` parts each belongs to; all of one object, and its decoys, to one.
-    good, good_decoys : ndarray of bool, shape (T,) and (D,)
-        Which are called good.
-    seed : int
-        Of the draws that intervals are taken from.
+    Folds (T,) and (D,) say which of `FOLDS` parts each belongs to: all of one object, and its
+    decoys, to one. `good` (T,) and `good_decoys` (D,) are called good. Intervals are taken from
+    draws of `seed`.
     """
     refitted = len(targets) >= LEAST_TARGETS and len(decoys) >= LEAST_DECOYS
     scores, decoy_scores = (logit(same_objects(values)) for values in (targets, decoys))

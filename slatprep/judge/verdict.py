@@ -149,9 +149,13 @@ def mirror_gain_of(alignment: Alignment) -> float:
 
 def contradicted(judgement: Judgement) -> Judgement:
     """Return the judgement of an asset whose latents contradict its labels."""
+    return replace(_doubted(judgement, _CONTRADICTED), contradicted=True)
+
+
+def _doubted(judgement: Judgement, reason: str) -> Judgement:
+    """Return a judgement that is not good, for one more reason."""
     verdict = Verdict.DOUBTFUL if judgement.verdict is Verdict.GOOD else judgement.verdict
-    reasons = (*judgement.reasons, _CONTRADICTED)
-    return replace(judgement, verdict=verdict, reasons=reasons, contradicted=True)
+    return replace(judgement, verdict=verdict, reasons=(*judgement.reasons, reason))
 
 
 def merged(judgement: Judgement, annotation: Annotation) -> Judgement:
@@ -177,12 +181,11 @@ def merged(judgement: Judgement, annotation: Annotation) -> Judgement:
     least = THRESHOLDS.good_accuracy
     if not expected < least <= judgement.expected_accuracy:
         return together
-    verdict = Verdict.DOUBTFUL if judgement.verdict is Verdict.GOOD else judgement.verdict
-    reason = (
+    return _doubted(
+        together,
         f"its annotations differ: only {expected:.1%} of the labels can be expected to be right "
-        f"(good needs {least:.0%})"
+        f"(good needs {least:.0%})",
     )
-    return replace(together, verdict=verdict, reasons=(*judgement.reasons, reason))
 
 
 def voxel_confidence(

@@ -1,6 +1,7 @@
 """Gaussians follow the particles around them: rigid motions exactly, everything else kept."""
 
 import importlib.util
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -33,28 +34,28 @@ NEWTON = pytest.mark.skipif(
 )
 
 
+ROTATION, SCALE = [f"rot_{i}" for i in (1, 2, 3, 0)], [f"scale_{i}" for i in range(3)]
+
+
 def random_gaussians(count: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     places = rng.uniform(REST.min(axis=0), REST.max(axis=0), (count, 3))
     made = gaussians_of(places, rng.integers(0, 7, count).astype(np.uint8), H)
-    quaternions = Rotation.random(count, rng=rng).as_quat()
-    for name, values in zip(("rot_1", "rot_2", "rot_3", "rot_0"), quaternions.T, strict=True):
+    drawn = [*Rotation.random(count, rng=rng).as_quat().T, *rng.normal(-4, 0.5, (3, count))]
+    for name, values in zip([*ROTATION, *SCALE], drawn, strict=True):
         made[name] = values
-    for name in ("scale_0", "scale_1", "scale_2"):
-        made[name] = rng.normal(-4, 0.5, count)
     made["nx"] = rng.normal(size=count)
     return made
 
 
-def places_of(rows: np.ndarray) -> np.ndarray:
-    return np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
+def columns(rows: np.ndarray, names: Iterable[str] = "xyz") -> np.ndarray:
+    return np.stack([rows[name] for name in names], axis=1).astype(float)
 
 
 def covariances(rows: np.ndarray) -> np.ndarray:
     """Return the covariance of each Gaussian, as a renderer makes it of scales and rotation."""
-    turn = Rotation.from_quat(np.stack([rows[f"rot_{i}"] for i in (1, 2, 3, 0)], 1)).as_matrix()
-    scale = np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], 1).astype(float))
-    half = turn * scale[:, None, :]
+    turn = Rotation.from_quat(columns(rows, ROTATION)).as_matrix()
+    half = turn * np.exp(columns(rows, SCALE))[:, None, :]
     return half @ half.transpose(0, 2, 1)
 
 
@@ -64,12 +65,12 @@ def test_a_rigid_motion_moves_and_turns_each_gaussian_exactly(axes, seed):
     rng = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
     saved = random_gaussians(50, seed)
-    places = places_of(saved) @ SAVED_AXES[axes]  # of the file, to the SLAT frame
+    places = columns(saved) @ SAVED_AXES[axes]  # of the file, to the SLAT frame
     motion = np.tile(turn, (len(REST), 1, 1))
     moved, gradients = carry(bind(places, REST, H), REST @ turn.T + shift, motion)
     np.testing.assert_allclose(moved, places @ turn.T + shift, atol=1e-9)
     rows = deform(saved, moved, gradients, axes)
-    np.testing.assert_allclose(places_of(rows) @ SAVED_AXES[axes], moved, atol=1e-6)
+    np.testing.assert_allclose(columns(rows) @ SAVED_AXES[axes], moved, atol=1e-6)
     # A renderer sees the same covariance, turned in the axes of the file.
     in_file = SAVED_AXES[axes] @ turn @ SAVED_AXES[axes].T
     np.testing.assert_allclose(
@@ -86,15 +87,15 @@ def test_an_affine_motion_deforms_covariances_where_asked(seed):
     affine = np.eye(3) + rng.uniform(-0.25, 0.25, (3, 3))
     saved = random_gaussians(40, seed)
     motion = np.tile(affine, (len(REST), 1, 1))
-    carrier = bind(places_of(saved), REST, H)
+    carrier = bind(columns(saved), REST, H)
     moved, gradients = carry(carrier, REST @ affine.T, motion)
-    np.testing.assert_allclose(moved, places_of(saved) @ affine.T, atol=1e-9)
+    np.testing.assert_allclose(moved, columns(saved) @ affine.T, atol=1e-9)
     rows = deform(saved, moved, gradients, "slat", stretch=True)
     expected = affine @ covariances(saved) @ affine.T
     np.testing.assert_allclose(covariances(rows), expected, rtol=2e-3, atol=1e-8)
     turned = rotations(gradients)
-    np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), np.tile(np.eye(3), (40, 1, 1)),
-                               atol=1e-9)  # fmt: skip
+    eyes = np.broadcast_to(np.eye(3), turned.shape)
+    np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), eyes, atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(turned), 1.0)
 
 
@@ -110,7 +111,7 @@ def test_the_nearest_gaussian_is_drawn_in_its_colour(tmp_path):
     places = np.array([[0.0, -0.3, 0.0], [0.0, 0.3, 0.16], [0.3, 0.0, 0.3]])
     rows = gaussians_of(places, np.array([0, 1, 2], np.uint8), 0.4)
     rows["opacity"][2] = -6.0  # As good as transparent.
-    for name in ("scale_0", "scale_1", "scale_2"):
+    for name in SCALE:
         rows[name] = np.log(0.08)
     picture = draw(rows, places, np.full(3, -0.5), np.full(3, 0.5), pixels=100)
     seen = {tuple(colour) for colour in picture.reshape(-1, 3)}
@@ -129,14 +130,11 @@ def write_prediction(path: Path) -> np.ndarray:
     return coords
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--picture", "a.mp4"), "expected a name that ends in .gif, .png, .webp"),
-        (("--asset", "cup"), "expected either --asset, with --store, or --prediction"),
-        (("--gaussians", "points.ply"), "expected a PLY of Gaussians"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (("--picture", "a.mp4"), "expected a name that ends in .gif, .png, .webp"),
+    (("--asset", "cup"), "expected either --asset, with --store, or --prediction"),
+    (("--gaussians", "points.ply"), "expected a PLY of Gaussians"),
+])  # fmt: skip
 def test_what_cannot_be_simulated_is_said(words, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     coords = write_prediction(tmp_path / "p.npz")
@@ -169,7 +167,7 @@ def test_gaussians_of_trellis_fall_as_the_object_does(tmp_path):
         for number in range(7)
     ]
     np.testing.assert_array_equal(frames[0]["nx"], saved["nx"])
-    np.testing.assert_allclose(places_of(frames[0]), places_of(saved), atol=1e-6)
+    np.testing.assert_allclose(columns(frames[0]), columns(saved), atol=1e-6)
     # The file's y points down. Free fall; implicit steps of dt fall g t dt / 2 further.
     for number, frame in enumerate(frames):
         t, dt = number / rate, 1 / (4 * rate)

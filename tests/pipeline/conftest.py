@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 from support.faults import inject
-from support.published import IDS, files, make_published, parameters
+from support.published import IDS, make_published, parameters
 from support.synthetic import Dataset, Made
+from support.trees import tree
 
 from slatprep.pipeline.dataset import build_store
 
@@ -64,8 +65,8 @@ def objects(made: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def unpacked(made: Path) -> dict[str, bytes]:
+def unpacked(made: Path) -> dict[str, str]:
     """Return the files of the store of the unpacked folder."""
     wanted = parameters(made, "pixieverse/render_outputs", categories=True)
     build_store(wanted, made / "unpacked.zarr")
-    return files(made / "unpacked.zarr")
+    return tree(made / "unpacked.zarr")

@@ -8,8 +8,9 @@ import zlib
 from pathlib import Path
 
 import pytest
-from support.published import IDS, add, files, pack, parameters, write_object
+from support.published import IDS, add, pack, parameters, write_object
 from support.synthetic import make_asset
+from support.trees import tree
 
 from slatprep.errors import InputError
 from slatprep.inspect.verify import verify_store
@@ -33,7 +34,7 @@ def test_store_of_archives_is_that_of_the_unpacked_folder(made, tmp_path, unpack
     chosen = parameters(made, root, categories=root == "pixieverse")
     summary = build_store(chosen, tmp_path / "s.zarr")
     assert summary.statuses == {"ok": 4, "failed": 0, "skipped": 1}
-    assert files(tmp_path / "s.zarr") == unpacked
+    assert tree(tmp_path / "s.zarr") == unpacked
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
 
 
@@ -133,7 +134,7 @@ def test_what_changed_in_an_archive_is_built_again_alone(objects, made, tmp_path
     build_store(parameters(made, folder), tmp_path / "fresh.zarr")
     records = json.loads((tmp_path / "s.manifests" / "build.json").read_text())
     assert records["statuses"]["ok"] == 4
-    assert files(tmp_path / "s.zarr") == files(tmp_path / "fresh.zarr")
+    assert tree(tmp_path / "s.zarr") == tree(tmp_path / "fresh.zarr")
 
 
 @pytest.fixture

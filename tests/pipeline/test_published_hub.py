@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 from huggingface_hub import HfFileSystem, constants
-from support.published import IDS, files, pack, parameters
+from support.published import IDS, pack, parameters
 from support.published_hub import PublishedHub
+from support.trees import tree
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.inspect.verify import verify_store
@@ -41,7 +42,7 @@ def hub(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 @pytest.mark.parametrize("root", ["", "@main"])
 def test_store_of_the_hub_is_that_of_the_unpacked_folder(hub, made, tmp_path, unpacked, root):
     build_store(parameters(made, URL + root), tmp_path / "s.zarr")
-    assert files(tmp_path / "s.zarr") == unpacked
+    assert tree(tmp_path / "s.zarr") == unpacked
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
 
 
@@ -144,7 +145,7 @@ def test_connection_that_ends_in_the_middle_is_made_again(hub, made, tmp_path, u
     hub.cut = 2
     build_store(parameters(made, URL), tmp_path / "s.zarr")
     assert hub.cut == 0
-    assert files(tmp_path / "s.zarr") == unpacked
+    assert tree(tmp_path / "s.zarr") == unpacked
 
 
 def test_build_stays_with_the_commit_that_it_began_with(objects, hub, made):

@@ -39,14 +39,9 @@ def kill_self() -> None:
 
 
 def environment(folder: Path, fault: str = "") -> dict[str, str]:
-    """Return the environment of a process, and of its workers, with a fault.
+    """Return the environment of a process, and of its workers, with a fault, if any.
 
-    Parameters
-    ----------
-    folder : Path
-        Where a module for it is written.
-    fault : str
-        The body of ``def reached(step, name)``; empty for none.
+    The fault is the body of ``def reached(step, name)``; a module for it is written to the folder.
     """
     folder.mkdir(exist_ok=True)
     here = str(Path(__file__).parents[1])

@@ -59,22 +59,11 @@ ANY_NUMBER = -1
 
 @dataclass
 class Faults:
-    """What the proxy does; nothing while `chance` is 0.
+    """What the proxy does; nothing while `chance`, the share of requests it spoils, is 0.
 
-    Attributes
-    ----------
-    chance : float
-        The share of requests that something happens to.
-    kinds : tuple of str
-        What may.
-    lasting : bool
-        Whether a request that is repeated meets the same again.
-    only : str
-        A pattern of the addresses that something may happen to.
-    rate : float
-        Bytes a second of every connection; 0 for as many as there may be, below 0 for no answer.
-    told : Counter
-        What happened, and how often.
+    Only what has an address of the pattern `only` meets one of the `kinds`, and the same again
+    where that is `lasting`. Of every connection `rate` is the bytes a second: 0 for as many as
+    there may be, below 0 for no answer. `told` counts what happened.
     """
 
     seed: str = ""

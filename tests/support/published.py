@@ -108,12 +108,3 @@ def parameters(made: Path, root: str | Path, categories: bool = False) -> BuildP
     pairing = replace(base.pairing, categories=made / "classes.json" if categories else None)
     place = place_of(root) if "://" in str(root) else made / root
     return replace(base, pixieverse=replace(base.pixieverse, root=place), pairing=pairing)
-
-
-def files(store: Path) -> dict[str, bytes]:
-    """Return the content of all files of a store."""
-    return {
-        path.relative_to(store).as_posix(): path.read_bytes()
-        for path in sorted(store.rglob("*"))
-        if path.is_file()
-    }
