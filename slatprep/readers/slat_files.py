@@ -72,11 +72,10 @@ def discover_slats(source: SlatSource) -> list[SlatFile]:
         raise ConfigError(
             f"{root}: expected a SLAT as .npz, {' or '.join(SUFFIXES)}, or a folder of them"
         )
-    groups = one_file and root.suffix != ".npz"
-    slats = list(_each_slat(source, True)) if groups else []
-    if one_file and not slats:
-        slats = [NamedSlat(root.name.rpartition(".")[0], "", root.name)]
-    elif not one_file:
+    if one_file:
+        slats = list(_each_slat(source, True)) if root.suffix != ".npz" else []
+        slats = slats or [NamedSlat(root.name.rpartition(".")[0], "", root.name)]
+    else:
         slats = [slat for found in find_slats(source, False).values() for slat in found]
     folder, named = root.parent if one_file else root, dict[str, SlatFile]()
     for slat in ordered(slats):

@@ -47,15 +47,6 @@ _FEW = 0.05
 """A class with a smaller share of the voxels does not count."""
 
 
-def _bring_to_si(values: NDArray[np.float32], table: Sequence[Property], units: Units) -> None:
-    """Bring values (K, P) to SI units, in place, where a unit is stated for a column of those."""
-    for column, one in enumerate(table):
-        unit = units.of(one.name)
-        if unit and FACTORS.get(one.unit) == 1.0:
-            with np.errstate(over="ignore"):
-                values[:, column] = to_si(values[:, column], unit)
-
-
 def require_plausible(
     where: str | Place,
     values: NDArray[np.float32],
@@ -70,7 +61,11 @@ def require_plausible(
     where most voxels cannot be and `roots.plausibility` is ``refuse``. Values that are none, such
     as NaN, are left to the reader.
     """
-    _bring_to_si(values, table, roots.units)
+    for column, one in enumerate(table):
+        unit = roots.units.of(one.name)
+        if unit and FACTORS.get(one.unit) == 1.0:
+            with np.errstate(over="ignore"):
+                values[:, column] = to_si(values[:, column], unit)
     if roots.plausibility == "off" or len(values) == 0:
         return []
     parts = _parts(values, material, table, classes)

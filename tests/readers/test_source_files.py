@@ -111,14 +111,11 @@ def test_npy_headers_that_lie(text, version):
     refused(r"^x\.npy: ", npy_array, data, "x.npy", ROWS["feats"])
 
 
-def test_npy_header_that_claims_four_gigabytes():
+def test_npz_that_claims_gigabytes_costs_nothing():
     header = b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b" " * 100
     bomb = npz_bytes(feats=header + b" " * 2**26)
     assert len(bomb) < 2**20
     refused(r"x\.npz \[feats\]", npz_arrays, bomb, "x.npz", ROWS)
-
-
-def test_npz_that_claims_ten_gigabytes_costs_nothing():
     header = npy_header("{'descr': '<f4', 'fortran_order': False, 'shape': (335544320, 8)}\n")
     honest = npz_bytes(feats=header + b"\0" * 1000)
     # The same claim in the archive's own directory, so that both agree.
@@ -171,6 +168,6 @@ def test_hdf5_that_claims_or_inflates_to_gigabytes_costs_nothing(make_pair):
 
 def test_a_shape_of_truth_values_is_refused():
     """Python takes True for 1, and numpy makes an array of it that cannot be shaped again."""
-    data = npy(np.zeros((1, 3), np.float32)).replace(b"(1, 3), }   ", b"(True, 3), }", 1)
-    with pytest.raises(InputError, match=r"has shape \(True, 3\)"):
-        npy_array(data, "x.npy", ArraySpec(((None, 3),), "f"))
+    text = "{'descr': '<f4', 'fortran_order': False, 'shape': (True, 8)}"
+    data = npy_header(text) + FEATS[:1].tobytes()
+    refused(r"has shape \(True, 8\)", npy_array, data, "x.npy", ROWS["feats"])
