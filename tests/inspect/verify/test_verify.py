@@ -126,6 +126,8 @@ OUT_OF_THE_CONTRACT: list[list[tuple[str, Any, object, str]]] = [
         ("voxel/distance", (0, 6), 2.5, "1 of "),
         ("voxel/coords", (1, 3), (64, 0, 0), "a coordinate above 63"),
         ("voxel/properties", (2, 4, 1), np.nan, "a property that does not go with valid"),
+        ("voxel/coords", (3, 0), (1, 1, 1), "a coordinate occurs twice"),
+        ("voxel/coords", (3, 1), (1, 1, 1), "a coordinate occurs twice"),
         ("voxel/feats", (4, 5, 2), np.inf, "NaN or infinite"),
         ("voxel/properties", (4, 4, 1), 1.5, "a property that does not go with valid"),
         ("voxel/material", (4, 4), 7, "a class that does not go with valid"),
