@@ -267,7 +267,7 @@ def test_rows_beyond_what_an_asset_may_have_are_refused(own):
     for row in (-1, 4):
         with pytest.raises(StoreError, match=f"has no asset {row}; it has 4 assets"):
             store.rows(row)
-    offsets[0] = -1
+    offsets[:2] = [-1, 4]
     with pytest.raises(StoreError, match="asset 0 has rows -1 to"):
         open_store(own).rows(0)
 
