@@ -35,10 +35,10 @@ from slatprep.geometry.voxels import occupancy_of, voxels_of
 from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
 from slatprep.pipeline.annotate import annotate, process_several
-from slatprep.pipeline.before import as_read
 from slatprep.pipeline.plan import Action, BuildContext, PlannedAsset
 from slatprep.pipeline.recipe import Recipe, record_of, record_of_failed
-from slatprep.pipeline.rows import Row, SourceStore
+from slatprep.pipeline.rows import Row
+from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers import read_field, read_latents, reading_of, source_digests
 from slatprep.records import (
@@ -88,13 +88,16 @@ def finish_asset(
     `strict`, the asset's own fault.
     """
     reached("asset begun", pair.asset_id)
-    if planned.action is Action.RESUME:
-        resumed = _resumed(planned, context.spool)
-        if resumed is not None:
-            return resumed
+    if planned.action is Action.RESUME and (resumed := _resumed(planned, context.spool)):
+        return resumed
+    damaged = ""
     try:
         with noting() as noted:
-            asset, key, damaged = _processed(pair, planned, context)
+            asset = _repeated(pair, planned, context)
+            if asset is None:
+                asset = process_asset(pair, context.parameters)
+                damaged = "what the store holds of it is not what its record and its sources give"
+        key = _key(asset, context.recipe)
         record = record_of(asset, context.recipe, key)
         if faults := faults_of(record):
             what = f"what was found is more than a record may hold ({'; '.join(faults[:3])})"
@@ -104,6 +107,8 @@ def finish_asset(
         if context.strict:
             raise
         return record_of_failed(_failure(pair, error), context.recipe)
+    if planned.action is not Action.REUSE or planned.key != key:  # It changed since the plan.
+        damaged = ""
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
     return replace(kept, damaged=damaged, seen=as_read(pair, noted))
 
@@ -116,31 +121,16 @@ def fail_asset(pair: AssetPair, planned: PlannedAsset, context: BuildContext) ->
     return record_of_failed(Failed(pair, Status.FAILED, reason), context.recipe)
 
 
-def _processed(
-    pair: AssetPair, planned: PlannedAsset, context: BuildContext
-) -> tuple[Finished, str, str]:
-    """Return an asset, its key, and in words why what the store has of it does not hold."""
-    damaged = ""
-    if context.previous is not None and planned.action is Action.REUSE:
-        asset = _repeated(pair, planned.key, context, context.previous)
-        if asset is not None:
-            return asset, planned.key, ""
-        damaged = "what the store holds of it is not what its record and its sources give"
-    asset = process_asset(pair, context.parameters)
-    key = _key(asset, context.recipe)
-    return asset, key, damaged if planned.key == key else ""  # It changed since the plan.
-
-
-def _repeated(
-    pair: AssetPair, key: str, context: BuildContext, previous: SourceStore
-) -> Finished | None:
-    """Return an asset as its record tells of it; None where that does not hold any more."""
+def _repeated(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> Finished | None:
+    """Return an asset as its record tells of it; None where there is none that still holds."""
+    if context.previous is None or planned.action is not Action.REUSE:
+        return None
     try:
-        known = previous.record(pair.asset_id)
+        known = context.previous.record(pair.asset_id)
     except StoreError:
         return None
     asset = process_asset(pair, context.parameters, known)
-    same = _key(asset, context.recipe) == key and previous.holds(asset)
+    same = _key(asset, context.recipe) == planned.key and context.previous.holds(asset)
     return asset if same else None
 
 
@@ -157,25 +147,23 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
     """Return what an interrupted build finished, under the names things have now."""
     found = spool.find(planned.key)
     if found and planned.names:
-        spool.amend(planned.names.applied(found[0]))
+        spool.amend(replace(found[0], **planned.names))
         found = spool.find(planned.key)
-    return found and found[1]
+    return found and replace(found[1], seen=planned.seen)
 
 
 def _failure(pair: AssetPair, error: Exception) -> Failed:
     """Say why an asset cannot go in, in one line, and where slatprep itself is at fault."""
-    line = " ".join(str(error).split())
+    line, trace = " ".join(str(error).split()), ""
     if len(line) > _REASON:
         line = f"{line[:_REASON]} ..."
-    if isinstance(error, MissingPartnerError):
-        return Failed(pair, Status.SKIPPED, line)
-    if isinstance(error, SlatprepError):
-        return Failed(pair, Status.FAILED, line)
     if isinstance(error, MemoryError):
         line = f"memory ran out ({line or 'no more could be had'}); run with fewer jobs"
-        return Failed(pair, Status.FAILED, line)
-    line = f"internal error, please report: {type(error).__name__}: {line}"
-    return Failed(pair, Status.FAILED, line, traceback.format_exc()[-_TRACEBACK:])
+    elif not isinstance(error, SlatprepError):
+        line = f"internal error, please report: {type(error).__name__}: {line}"
+        trace = traceback.format_exc()[-_TRACEBACK:]
+    missing = isinstance(error, MissingPartnerError)
+    return Failed(pair, Status.SKIPPED if missing else Status.FAILED, line, trace)
 
 
 WHEN = (

@@ -1,13 +1,9 @@
 """What is there before a build: a store, and sources that are as they were.
 
+Of a first build nothing is, and nobody needs this to understand one.
+
 Sources are as they were by the state of their files. Of those, each build hashes a share all the
 same, drawn anew. Where one of them is another one, no state is trusted.
-
-`slatprep.storage.states` says when a state of a source proves that its content is the same. It is
-taken as the source is read, and beside it stands the key that the content gave. The file
-`NAME` lies beside the records of a build, with a digest of its own; it holds for this machine,
-this store and the same code and parameters. Where anything of that is otherwise, the sources are
-hashed.
 """
 
 from __future__ import annotations
@@ -15,46 +11,32 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import platform
 import random
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-import orjson
-
-from slatprep.errors import InputError, SlatprepError, StoreError
-from slatprep.parameters import BuildParameters
+from slatprep.errors import SlatprepError, StoreError
+from slatprep.pipeline.plan import Crew
 from slatprep.pipeline.publish import Destination
-from slatprep.pipeline.recipe import Recipe
-from slatprep.pipeline.rows import NextStore, SourceStore, checked_store, store_there
+from slatprep.pipeline.recipe import Recipe, Wanted
+from slatprep.pipeline.rows import NextStore, Row, SourceStore, checked_store
+from slatprep.pipeline.seen import bound_to, look, read_seen, write_seen
 from slatprep.readers import hash_sources
-from slatprep.readers.slat import texture_of
-from slatprep.records import AssetPair, Contents, Place
-from slatprep.storage.files import open_regular, private_file
+from slatprep.records import AssetPair, Place
 from slatprep.storage.place import storage_of
-from slatprep.storage.states import Noted, States, boot_id, is_settled, settle
-from slatprep.store import Store
+from slatprep.storage.states import is_settled, settle
+from slatprep.store import Store, open_store
+from slatprep.store.reader import is_store
 from slatprep.store.records import BUILD, file_names
 from slatprep.workers.local import Jobs, run_unordered
 
 SHARE = 0.01
 """Share of the sources whose state is as it was that a build hashes all the same."""
 
-NAME = "sources.seen"
-"""Of the file, in the folder of the records, or on this machine's disk where those are not."""
 
-_ROW = np.dtype([("state", "V16"), ("key", "V32")])
-_HEAD = 3 * 32
-"""Bytes before the rows: three digests."""
-
-_FORMAT = "slatprep-seen-4"
-_UNKNOWN = bytes(16)
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Before:
     """What is there before a build.
 
@@ -62,18 +44,14 @@ class Before:
     ----------
     place : Destination
         Where the store lies, and its records.
-    recipe : Recipe
-        Parameters and code.
-    asked : str
-        What tells them, and how sources are read.
     pairs : sequence of AssetPair
         The dataset.
-    states : mapping of str to bytes
-        State of each asset's sources, by id.
+    wanted : Wanted
+        What the build is asked for.
     previous : SourceStore or None
-        The store that is there. Its files have been read once it is `checked`.
-    known : mapping of str to str
-        Keys of the assets whose sources are as the last build saw them.
+        The store that is there. Its files have been read once it is checked.
+    known : mapping of str to (bytes, str)
+        State and key of the assets whose sources are as the last build saw them.
     as_left : bool
         Whether the files of store and records are as the last build left them.
     damaged : tuple of str
@@ -85,27 +63,27 @@ class Before:
     """
 
     place: Destination
-    recipe: Recipe
-    asked: str
     pairs: Sequence[AssetPair]
-    states: Mapping[str, bytes] = field(default_factory=dict)
+    wanted: Wanted
     previous: SourceStore | None = None
-    known: Mapping[str, str] = field(default_factory=dict)
+    known: Mapping[str, tuple[bytes, str]] = field(default_factory=dict)
     as_left: bool = False
     damaged: tuple[str, ...] = ()
     unnoticed: tuple[str, ...] = ()
     seed: int | None = None
 
     @property
-    def untouched(self) -> bool:
-        """Whether sources, store and records are as the last build left them, and of one set."""
+    def suffices(self) -> bool:
+        """Whether sources, store and records are as the last build left them, and as asked for."""
         if self.previous is None or not self.as_left:
             return False
-        return len(self.known) == len(self.pairs) == len(self.previous.store)
+        store = self.previous.store
+        same = len(self.known) == len(self.pairs) == len(store)
+        return same and self.wanted.allows(store)
 
-    def holds(self, following: NextStore) -> bool:
+    def holds(self, new: NextStore) -> bool:
         """Whether the store that is there is sound, and the one that would be written."""
-        return self.previous is not None and not self.damaged and following.same_as(self.previous)
+        return self.previous is not None and not self.damaged and new.same_as(self.previous)
 
     def standing_files(self, assets: int, taken: Collection[int] | None) -> set[str]:
         """Return the files of lines that need not be looked at, of a store of so many assets.
@@ -116,92 +94,86 @@ class Before:
         if not self.as_left or self.damaged or self.previous is None:
             return set()
         names, old = file_names(assets), file_names(len(self.previous.store))
-        return {
-            name
-            for number, name in enumerate(names)
-            if old[number : number + 1] == [name] and (taken is None or number in taken)
-        }
+        both = enumerate(zip(names, old, strict=False))
+        return {name for k, (name, was) in both if name == was and (taken is None or k in taken)}
 
-    def checked(self, jobs: Jobs) -> Before:
-        """Return it with a store whose records and columns have been compared with their digests.
+    def check(self, jobs: Jobs) -> None:
+        """Compare the records and columns of the store with their digests.
 
-        So have all other files, unless their states are as they were left, or they lie on an
+        So are all other files, unless their states are as they were left, or they lie on an
         object store, which keeps sums of its own.
         """
         if self.previous is None:
-            return self
+            return
         trusted = self.as_left or storage_of(self.place.store).local is None
-        previous, damaged = checked_store(self.place.store, jobs, "asset/" if trusted else "")
-        known = {} if damaged else self.known
-        return replace(self, previous=previous, damaged=damaged, known=known)
+        below = "asset/" if trusted else ""
+        self.previous, self.damaged = checked_store(self.previous, jobs, below)
+        if self.damaged:
+            self.known = {}
 
-    def sampled(self, share: float, seed: int | None, jobs: Callable[[int], Jobs]) -> Before:
-        """Return it after a share of the known sources has been hashed, by the clock if not a seed.
+    def note(self, store: Store, rows: Iterable[Row]) -> None:
+        """Write down what was seen of the sources of these rows of a store that is in place."""
+        state = _store_state(self.place, self.place.manifests(store.path), len(store), wait=True)
+        seen = {row.asset_id: row.seen for row in rows}
+        states = [seen.get(asset_id, b"") for asset_id in store.ids]
+        folder, bound = _seen_folder(self.place), self._bound_to(store)
+        write_seen(folder, bound, state, states, map(bytes, store.column("key")))
 
-        If one is not as it was, no sources are known. `jobs` says who hashes so many.
-        """
+    def _bound_to(self, store: Store) -> bytes:
+        """Return what states hold for: this machine, a build's store, and how it was read."""
+        wanted, own = self.wanted, self.wanted.parameters.pixieverse
+        slat, also = wanted.parameters.slat, wanted.parameters.also
+        read = (wanted.declared, slat, also, own.units, own.plausibility)
+        return bound_to(store.about.manifest, wanted.recipe.key("", {"": str(read)}))
+
+    def _is_as_left(self, previous: SourceStore, state: bytes) -> bool:
+        try:
+            assets, folder = len(previous.store), self.place.manifests()
+            return any(state) and _store_state(self.place, folder, assets) == state
+        except StoreError:  # Damaged: how many rows there are is not known.
+            return False
+
+    def _sample(self, share: float, seed: int | None, crew: Crew) -> None:
+        """Hash a share of the known sources; if one is not as it was, no sources are known."""
         seed = time.time_ns() if seed is None else seed
         ids = sorted(self.known)
         drawn = set(random.Random(seed).sample(ids, math.ceil(share * len(ids))))
-        tasks = [(pair, self.recipe) for pair in self.pairs if pair.asset_id in drawn]
-        keys = run_unordered(key_of, tasks, jobs(len(tasks)))
-        others = tuple(sorted(one for one, key in keys if key != self.known[one]))
-        return replace(
-            self, known={} if others else self.known, unnoticed=others, seed=seed if drawn else None
-        )
-
-    def note(self, store: Store, manifests: Place, read: Mapping[str, bytes]) -> None:
-        """Write down what was seen of the assets of a store that is in place.
-
-        `read` has the states of the sources that were read, as they were then.
-        """
-        bound = bound_to(store.about.manifest, self.asked)
-        state = _store_state(self.place, manifests, len(store), wait=True)
-        keys = zip(store.ids, (bytes(key).hex() for key in store.column("key")), strict=True)
-        states = {asset_id: self.states[asset_id] for asset_id in self.known} | dict(read)
-        write_seen(_seen_folder(self.place), bound, state, states, dict(keys))
+        recipe = self.wanted.recipe
+        tasks = [(pair, recipe) for pair in self.pairs if pair.asset_id in drawn]
+        keys = run_unordered(key_of, tasks, crew.of(len(tasks)))
+        self.unnoticed = tuple(sorted(one for one, key in keys if key != self.known[one][1]))
+        self.seed = seed if drawn else None
+        if self.unnoticed:
+            self.known = {}
 
 
 def look_back(
     place: Destination,
     pairs: Sequence[AssetPair],
-    parameters: BuildParameters,
-    recipe: Recipe,
-    declared: Contents,
+    wanted: Wanted,
+    crew: Crew,
     fresh: bool = False,
-    rehash: bool = False,
+    rehash: float = SHARE,
+    seed: int | None = None,
 ) -> Before:
-    """Look at the sources, the store and what the last build saw; with `rehash` not at the sources.
+    """Look at the sources, the store and what the last build saw; hash a share of the sources.
 
-    With `fresh` it is as if there were no store.
+    It is drawn by the clock if not by a seed. With `fresh` it is as if there were no store.
     """
-    own = parameters.pixieverse
-    asked = (declared, parameters.slat, parameters.also, own.units, own.plausibility)
-    before = Before(place, recipe, recipe.key("", {"": str(asked)}), pairs)
-    previous = None if fresh else store_there(place.store)
-    if previous is None:
-        # One that cannot be opened is told of when it is checked.
-        damaged = () if fresh else checked_store(place.store, 1)[1]
-        return replace(before, damaged=damaged)
-    seen = read_seen(_seen_folder(place), bound_to(previous.store.about.manifest, before.asked))
-    states = {} if rehash or not seen.keys else look(pairs)
-    keys = ((asset_id, seen.keys.get(state)) for asset_id, state in states.items())
-    return replace(
-        before,
-        states=states,
-        previous=previous,
-        known={asset_id: key for asset_id, key in keys if key is not None},
-        as_left=_is_as_left(previous, place, seen.store),
-    )
-
-
-def _is_as_left(previous: SourceStore, place: Destination, state: bytes) -> bool:
-    if state in (b"", bytes(32)):
-        return False
+    before = Before(place, pairs, wanted)
+    if fresh:
+        return before
     try:
-        return _store_state(place, place.manifests(), len(previous.store)) == state
-    except StoreError:  # Damaged: how many rows there are is not known.
-        return False
+        before.previous = previous = SourceStore(open_store(place.store).path)
+    except StoreError as error:
+        before.damaged = (str(error),) if is_store(place.store) else ()
+        return before
+    keys, state = read_seen(_seen_folder(place), before._bound_to(previous.store))
+    before.as_left = before._is_as_left(previous, state)
+    states = look(pairs) if keys and rehash < 1 else {}
+    before.known = {name: (own, keys[own]) for name, own in states.items() if own in keys}
+    before._sample(rehash, seed, crew)
+    return before
 
 
 def _store_state(place: Destination, manifests: Place, assets: int, wait: bool = False) -> bytes:
@@ -242,108 +214,3 @@ def key_of(pair: AssetPair, recipe: Recipe) -> tuple[str, str]:
         return pair.asset_id, recipe.key(pair.asset_id, hash_sources(pair)[1])
     except SlatprepError:
         return pair.asset_id, ""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What the last build saw.
-
-    Attributes
-    ----------
-    keys : dict of bytes to str
-        Keys of the assets of the store by the state of their sources.
-    store : bytes
-        State of the store's files and records when it was finished; empty if unknown.
-    """
-
-    keys: Mapping[bytes, str] = field(default_factory=dict)
-    store: bytes = b""
-
-
-def read_seen(folder: Path, bound: bytes) -> Seen:
-    """Read what the last build saw; nothing where no whole file is bound to the same."""
-    try:
-        with open_regular(folder / NAME) as file:
-            data = file.read()
-    except OSError:
-        return Seen()
-    if len(data) < _HEAD or _digest(data[32:]) != data[:32] or data[32:64] != bound:
-        return Seen()
-    rows = np.frombuffer(data, _ROW, offset=_HEAD)
-    keys = zip(rows["state"].tolist(), rows["key"].tolist(), strict=True)
-    return Seen({state: key.hex() for state, key in keys if state != _UNKNOWN}, data[64:96])
-
-
-def write_seen(
-    folder: Path, bound: bytes, store: bytes, states: Mapping[str, bytes], keys: Mapping[str, str]
-) -> None:
-    """Note the state of the sources of each asset of a store, where known, and its key, by id.
-
-    The file is written in place: half of one is noticed by its digest, and costs
-    the next build some hashing. So does a disk that does not take it.
-    """
-    rows = np.zeros(len(keys), _ROW)
-    for row, (asset_id, key) in zip(rows, keys.items(), strict=True):
-        row["state"], row["key"] = states.get(asset_id, _UNKNOWN), bytes.fromhex(key)
-    body = bound + (store or bytes(32)) + rows.tobytes()
-    try:
-        with private_file(folder / NAME) as file:
-            file.write(_digest(body) + body)
-    except OSError:
-        return
-
-
-def _digest(body: bytes) -> bytes:
-    """Return the digest of a file, which one of another form does not have."""
-    return hashlib.sha256(_FORMAT.encode() + body).digest()
-
-
-def bound_to(build_id: str, recipe: str) -> bytes:
-    """Return what states hold for: this machine, a build's store, and the recipe of its assets."""
-    machine = Path("/etc/machine-id")
-    try:
-        name = machine.read_text()
-    except (OSError, UnicodeDecodeError):
-        name = ""
-    parts = [_FORMAT, platform.node(), name, build_id, recipe]
-    return hashlib.sha256(orjson.dumps(parts)).digest()
-
-
-def look(pairs: Sequence[AssetPair]) -> dict[str, bytes]:
-    """Return the state of each asset's sources as they are, 16 bytes; zeros where none counts."""
-    states = States()
-    return {
-        pair.asset_id: _state_of(pair, lambda file: storage_of(file).state(states))
-        for pair in pairs
-    }
-
-
-def as_read(pair: AssetPair, noted: Mapping[str, Noted]) -> bytes:
-    """Return the state of an asset's sources as it was noted when they were read; see `look`."""
-    state = _state_of(pair, lambda file: noted.get(str(file)))
-    # Its reader may have read what `look` does not know of.
-    return _UNKNOWN if noted.keys() - {str(file) for file in _files(pair)} else state
-
-
-def _state_of(pair: AssetPair, state_of: Callable[[Place], Noted]) -> bytes:
-    names = (pair.asset_id, pair.object_id, pair.view, pair.category, pair.slat_group,
-             str(pair.roots.pixieverse), str(pair.roots.slat),
-             *(one.problem for one in pair.annotations))  # fmt: skip
-    states: list[object] = [boot_id(), names]
-    files = _files(pair)
-    for file in files:
-        state = state_of(file)
-        if state is None:
-            return _UNKNOWN
-        states.append((str(file), state))
-    return hashlib.blake2b(repr(states).encode(), digest_size=16).digest() if files else _UNKNOWN
-
-
-def _files(pair: AssetPair) -> list[Place]:
-    """Return the files of an asset, in an order; none where they cannot be told."""
-    try:
-        texture = pair.slat and texture_of(pair.slat, pair.roots.contents.latents)
-    except InputError:
-        return []
-    annotated = (place for one in pair.annotations for _, place in one.files)
-    return [file for file in (pair.slat, texture, *annotated) if file is not None]

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+
+import numpy as np
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.before import SHARE, Before, look_back
 from slatprep.pipeline.decoys import DECOYS, EVERY, measure_build
-from slatprep.pipeline.notices import counts_of, dataset_notices
-from slatprep.pipeline.pack import Packed, pack_store
+from slatprep.pipeline.notices import dataset_notices
+from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.plan import (
     Action,
     BuildContext,
@@ -27,12 +28,18 @@ from slatprep.pipeline.plan import (
     PlannedAsset,
     plan_assets,
 )
-from slatprep.pipeline.publish import Destination, publish_manifests, require_records_file
-from slatprep.pipeline.recipe import recipe_of
+from slatprep.pipeline.publish import (
+    BuildSummary,
+    Destination,
+    counts_of,
+    publish_store,
+    require_records_file,
+    summarise,
+)
+from slatprep.pipeline.recipe import Wanted, recipe_of
 from slatprep.pipeline.rows import NextStore, Row
-from slatprep.pipeline.settle import Wanted, check_objects, kept_rows, settle_rows
+from slatprep.pipeline.settle import check_objects, kept_rows, settle_rows
 from slatprep.pipeline.spool import Spool
-from slatprep.pipeline.summary import BuildSummary, summarise, summarise_store
 from slatprep.pipeline.work import Work, spool_of, work_beside, work_directory
 from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
@@ -130,43 +137,48 @@ def build_store(
         raise ConfigError(f"parameters are {parameters!r:.80}; expected those of load_parameters")
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
-    elsewhere = not isinstance(jobs, int)
     with (
         place.telling_if_stopped(),
         work_beside(
-            place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=elsewhere
+            place.store,
+            fresh=fresh,
+            keep=keep_work,
+            look=place.look,
+            private_disks=not isinstance(jobs, int),
         ) as work,
     ):
         pairs = _discover(parameters, jobs, work.shared(), note=note)
-        recipe = recipe_of(parameters)
-        every = rehash >= 1
-        before = look_back(place, pairs, parameters, recipe, wanted.declared, fresh, every)
-        before = before.sampled(rehash, rehash_seed, crew.of)
-        if before.previous and before.untouched and wanted.allows(before.previous.store):
-            return _publish(before, parameters, begin)
-        before = before.checked(crew.of(len(pairs)))
-        context = BuildContext(parameters, recipe, work.spool, before.previous, strict)
+        before = look_back(place, pairs, wanted, crew, fresh, rehash, rehash_seed)
+        if before.suffices:
+            return _publish(before, begin)
+        before.check(crew.of(len(pairs)))
+        context = BuildContext(parameters, wanted.recipe, work.spool, before.previous, strict)
         plan = _plan(pairs, context, crew, before.known)
-        # The alignment of those that are unchanged is in the store.
-        unchanged = [pair for pair in pairs if plan[pair.asset_id].action is Action.REUSE]
-        new = [pair for pair in pairs if plan[pair.asset_id].action is not Action.REUSE]
-        made = finish(new, plan, context, crew)
-        kept = []
-        if not keep_work:
-            kept = kept_rows(made, unchanged, plan, before, parameters, wanted)
-        finished = made if kept else [*made, *finish(unchanged, plan, context, crew)]
-        following, failed = settle_rows(finished, kept, before, context, wanted, crew)
-        packed = _pack(before, following, work, crew)
-        read: list[PlannedAsset | Row] = list(plan.values())
-        read += [asset for asset in finished if isinstance(asset, Row)]
-        seen = {one.asset_id: one.seen for one in read if one.seen}
-        summary = _publish(before, parameters, begin, following, packed, failed, seen)
+        assets = _finish_all(pairs, plan, context, crew, None if keep_work else before)
+        new, failed = settle_rows(assets, before, context, crew)
+        records = _pack(work, before, new, crew)
+        summary = _publish(before, begin, new, records, failed)
         if keep_work:
-            work.keep_only({row.key for row in following.rows if row.spooled})
-        if packed is not None:
-            aligned = sum(isinstance(asset, Row) for asset in made)
+            work.keep_only({row.key for row in new.rows if row.spooled})
+        if records is not None:
+            aligned = sum(plan[one].action is not Action.REUSE for one in new.ids)
             _measure(before, aligned, decoys, crew)
     return summary
+
+
+def _finish_all(
+    pairs: Sequence[AssetPair],
+    plan: Mapping[str, PlannedAsset],
+    context: BuildContext,
+    crew: Crew,
+    before: Before | None,
+) -> list[Row | FailedRecord]:
+    """Return all assets: those of the store that is there as rows of it, where they may stay."""
+    reused = [pair for pair in pairs if plan[pair.asset_id].action is Action.REUSE]
+    others = [pair for pair in pairs if plan[pair.asset_id].action is not Action.REUSE]
+    made = finish(others, plan, context, crew)
+    kept = kept_rows(made, reused, plan, before) if before else []
+    return [*made, *(kept or finish(reused, plan, context, crew))]
 
 
 def finish(
@@ -201,15 +213,11 @@ def finish(
     return assets
 
 
-def _pack(before: Before, following: NextStore, work: Work, crew: Crew) -> Packed | None:
-    """Write the next store and put it in place, unless the one that is there is the same."""
-    if before.holds(following):
+def _pack(work: Work, before: Before, new: NextStore, crew: Crew) -> frozenset[int] | None:
+    """See `pack_store`; None where the store that is there is the same."""
+    if before.holds(new):
         return None
-    place, jobs = before.place, crew.of(sum(row.spooled for row in following.rows))
-    with writing(str(place.out), work_directory(place.store).parent):
-        packed = pack_store(work.scratch, following, work.spool, jobs, work.shards)
-        place.replace(packed.store, packed.staged)
-    return packed
+    return pack_store(work, before.place, new, crew.of(sum(row.spooled for row in new.rows)))
 
 
 def _measure(before: Before, aligned: int, most: int, crew: Crew) -> None:
@@ -229,15 +237,16 @@ def plan_build(
     progress: Progress | None = None,
 ) -> BuildPlan:
     """Say what `build_store` would do with each asset, and why; nothing is written."""
-    place, declared = Destination(out), Wanted.of(parameters).declared
+    place, wanted, crew = Destination(out), Wanted.of(parameters), Crew(jobs, progress=progress)
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:
         spool = Spool(work_directory(place.store) / "nothing")
-    pairs, recipe = _discover(parameters, jobs), recipe_of(parameters)
-    before = look_back(place, pairs, parameters, recipe, declared, fresh, rehash).checked(jobs)
-    context = BuildContext(parameters, recipe, spool, before.previous, strict=False)
-    plan = plan_assets(pairs, context, Crew(jobs, progress=progress), before.known)
-    return BuildPlan(place.out, tuple(plan), before.damaged)
+    pairs = _discover(parameters, jobs)
+    before = look_back(place, pairs, wanted, crew, fresh, float(rehash))
+    before.check(jobs)
+    context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
+    plan = plan_assets(pairs, context, crew, before.known)
+    return BuildPlan(place.out, tuple(plan.values()), before.damaged)
 
 
 def align_pairs(
@@ -275,9 +284,14 @@ def align_pairs(
                 file.write(text + b"\n")
                 digests.append((asset.asset_id, digest_of(text)))
     failed = [asset for asset in assets if isinstance(asset, FailedRecord)]
-    counts = counts_of(asset for asset in assets if isinstance(asset, Row))
+    rows = [asset for asset in assets if isinstance(asset, Row)]
+    counts = counts_of(
+        [row.asset_id for row in rows],
+        np.array([row.n_voxels for row in rows], np.int64),
+        lambda name: np.array([row.columns[name] for row in rows]),
+    )
     build_id = build_id_of(parameters.name, digests)
-    return summarise(counts, failed, out, build_id, time.perf_counter() - begin)
+    return summarise(counts, failed, begin, records=out, build_id=build_id)
 
 
 def _discover(
@@ -295,43 +309,48 @@ def _plan(
     pairs: Sequence[AssetPair],
     context: BuildContext,
     crew: Crew,
-    known: Mapping[str, str] = MappingProxyType({}),
+    known: Mapping[str, tuple[bytes, str]] = MappingProxyType({}),
 ) -> dict[str, PlannedAsset]:
     """Return what is to be done by asset id: everything, where nothing was done before."""
     if context.previous is None and not context.spool.holds_any():
         return {p.asset_id: PlannedAsset(p.asset_id, Action.ALIGN, "new") for p in pairs}
-    return {asset.asset_id: asset for asset in plan_assets(pairs, context, crew, known)}
+    return plan_assets(pairs, context, crew, known)
 
 
 def _publish(
     before: Before,
-    parameters: BuildParameters,
     begin: float,
-    following: NextStore | None = None,
-    packed: Packed | None = None,
+    new: NextStore | None = None,
+    records: frozenset[int] | None = None,
     failed: Sequence[FailedRecord] = (),
-    seen: Mapping[str, bytes] = MappingProxyType({}),
 ) -> BuildSummary:
-    """Publish the store that is in place, or was there, with its manifests; note what was seen."""
+    """Publish the store that is in place, or was there, with its manifests; note what was seen.
+
+    `records` are the shards of records that were taken over; None where nothing was written.
+    """
     place, previous = before.place, before.previous
-    store = open_store(place.in_place(previous.path if previous and not packed else None))
-    manifests = place.manifests(store.path)
-    damaged, warnings = list(before.damaged), list[str]()
-    if following is not None:
-        damaged += [f"{row.asset_id}: {row.damaged}" for row in following.rows if row.damaged]
+    there = previous.path if previous and records is None else None
+    store, parameters = open_store(place.in_place(there)), before.wanted.parameters
+    rows, warnings = new.rows if new else (), list[str]()
     if before.unnoticed:
         warnings.append(
             f"the sources of {', '.join(before.unnoticed[:3])} changed, though their files look as "
             "they did; all sources were hashed"
         )
-    if following is not None and packed is not None:
-        warnings += dataset_notices(following, parameters)
-    seconds = time.perf_counter() - begin
-    summary = summarise_store(store, failed, place.out, manifests, seconds, warnings, damaged)
-    summary = replace(summary, rehash_seed=before.seed)
-    standing = before.standing_files(len(store), packed.records if packed else None)
-    publish_manifests(store, summary, parameters, failed, standing=standing)
-    place.publish()
-    if following is not None:
-        before.note(store, manifests, seen)
+    if new and records is not None:
+        warnings += dataset_notices(new, parameters)
+    damaged = [f"{row.asset_id}: {row.damaged}" for row in rows if row.damaged]
+    summary = publish_store(
+        place,
+        store,
+        parameters,
+        begin,
+        failed,
+        before.standing_files(len(store), records),
+        warnings=tuple(warnings),
+        damaged=(*before.damaged, *damaged),
+        rehash_seed=before.seed,
+    )
+    if new:
+        before.note(store, rows)
     return summary

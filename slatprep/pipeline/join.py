@@ -19,13 +19,11 @@ import orjson
 from slatprep.errors import ConfigError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.pack import pack_store
-from slatprep.pipeline.publish import Destination, publish_manifests
+from slatprep.pipeline.publish import BuildSummary, Destination, publish_store
 from slatprep.pipeline.rows import NextStore, Row, SourceStore
 from slatprep.pipeline.settle import resolved_contents
-from slatprep.pipeline.summary import BuildSummary, summarise_store
-from slatprep.pipeline.work import work_beside, work_directory
+from slatprep.pipeline.work import work_beside
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange
-from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
 from slatprep.store import open_store
 from slatprep.store.record_json import adapter_of
@@ -176,16 +174,8 @@ def _write(
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
     _require_unclipped(new)
     with work_beside(place.store, look=place.look) as work:
-        with writing(str(place.out), work_directory(place.store).parent):
-            jobs = at_most(len(new.rows) // _ROWS_A_JOB, jobs)
-            packed = pack_store(work.scratch, new, work.spool, jobs, progress=progress)
-            place.replace(packed.store, packed.staged)
-        store = open_store(place.in_place())
-        folder, seconds = place.manifests(store.path), time.perf_counter() - begin
-        summary = summarise_store(store, (), place.out, folder, seconds)
-        publish_manifests(store, summary, parameters)
-        place.publish()
-    return summary
+        pack_store(work, place, new, at_most(len(new.rows) // _ROWS_A_JOB, jobs), progress)
+        return publish_store(place, open_store(place.in_place()), parameters, begin)
 
 
 def _require_unclipped(new: NextStore) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import NextStore, Row, moments_of
-from slatprep.pipeline.summary import Counts, count
 from slatprep.readers.contents import ENOUGH, in_words, look_standardised
 from slatprep.readers.joins import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Verdict
@@ -26,17 +25,6 @@ _BESIDE_PIXIE = 0.5
 """Decades beyond Pixie's published ranges within which PixieVerse itself may reach."""
 
 _NAMED = 3
-
-
-def counts_of(assets: Iterable[Row]) -> Counts:
-    """Count what became of finished assets."""
-    usable = list(assets)
-    sizes = np.array([asset.n_voxels for asset in usable], np.int64)
-    return count(
-        [asset.asset_id for asset in usable],
-        sizes,
-        lambda name: np.array([asset.columns[name] for asset in usable]),
-    )
 
 
 def nothing_usable(
@@ -66,8 +54,7 @@ def dataset_notices(new: NextStore, parameters: BuildParameters) -> Iterator[str
     yield from unusual_values(new.rows)
     yield from shared_sources(new)
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
-        ids = [row.asset_id for row in new.rows]
-        yield from wild_ranges(ids, new.column("extent"), new.normalization)
+        yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
 
 
 def unusual_values(rows: Sequence[Row]) -> Iterator[str]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,12 @@ from slatprep.normalize import (
     normalize_change,
     normalize_properties,
 )
+from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.rows import NextStore, SourceStore, Where, record_text
 from slatprep.pipeline.spool import Spool
+from slatprep.pipeline.work import Work, work_directory
 from slatprep.records import UNANNOTATED, Normalization, Place
+from slatprep.storage.atomic import writing
 from slatprep.storage.faults import reached
 from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
@@ -50,54 +52,55 @@ _ROWS_MOVED = 65_536
 """Rows of an older store that are unpacked at a time, 4 MB in all arrays."""
 
 
-@dataclass(frozen=True)
-class Packed:
-    """A store that is made and not in place yet.
-
-    Attributes
-    ----------
-    store : Path
-        Where it was made.
-    staged : Staged
-        What of it is not there, as an object store has it already.
-    records : frozenset of int
-        Shards of records that are files of the store it replaces.
-    """
-
-    store: Path
-    staged: Staged
-    records: frozenset[int]
+_CLIPPED = {"voxel": "clipped", "grid": "clipped_grid"}
+"""Columns of what packing a group clips."""
 
 
 def pack_store(
-    folder: Path,
+    work: Work,
+    place: Destination,
     new: NextStore,
-    spool: Spool,
     jobs: Jobs,
-    at: Place | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Packed:
-    """Write a store into a folder; shards go to `at`, where that is on an object store.
+) -> frozenset[int]:
+    """Write a store and put it in place; return its shards of records that are the older store's.
 
     What an older store has in the same bytes is taken over: whole shards as files, if the new
     store replaces it, and chunks as they are packed.
     """
-    path = folder / "store.zarr"
+    with writing(str(place.out), work_directory(place.store).parent):
+        path = work.scratch / "store.zarr"
+        staged, records = _made(path, new, work, jobs, progress)
+        place.replace(path, staged)
+    return records
+
+
+def _made(
+    path: Path,
+    new: NextStore,
+    work: Work,
+    jobs: Jobs,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Staged, frozenset[int]]:
+    """Make a store; return what of it is not at `path`, and its shards of records taken over.
+
+    Shards go to where the work says, if that is on an object store.
+    """
     create_store(path, len(new.rows), new.offsets[-1], new.parameters, new.contents, new.merged)
     reached("store created", path.name)
-    remote = None if at is None else storage_of(at).remote
+    remote = storage_of(work.shards).remote
     if remote is not None:
         names = [name for group in GROUPS for name in arrays_in(group, new.merged)]
         put_objects(path, remote, [f"{name}/zarr.json" for name in names])
     runs = {group: _runs(path, group, new) for group in GROUPS}
-    taken, records = _taken(path, new, runs)
+    taken = _taken(new, runs)
     todo = list(shards([row.where for row in new.rows], new.offsets, new.parameters, runs, taken))
     clipped = {group: new.column(name) for group, name in _CLIPPED.items()}
     here, written = remote or path, dict[str, Written]()
     # Those of grids, which take longest, first: so the last shards keep all workers at work.
     todo.sort(key=lambda shard: shard.group != "grid")
     how = new.normalization, new.contents.background
-    tasks = ((here, spool, new.stores, shard, *how) for shard in todo)
+    tasks = ((here, work.spool, new.stores, shard, *how) for shard in todo)
     for done, (shard, counts, files) in enumerate(run_unordered(write_shard, tasks, jobs), 1):
         if shard.group in clipped:
             clipped[shard.group][shard.first : shard.first + len(shard.rows)] += counts
@@ -113,11 +116,8 @@ def pack_store(
     sizes = {name: file.size for name, file in afar.items()}
     digests = {name: file.sha256 for name, file in (written | files).items()}
     finish_store(path, new.normalization, new.build_id, new.build, new.contents, digests, sizes)
-    return Packed(path, Staged(sizes, digests, remote, before, frozenset(copied)), records)
-
-
-_CLIPPED = {"voxel": "clipped", "grid": "clipped_grid"}
-"""Columns of what packing a group clips."""
+    records = frozenset(number for group, number in taken if group == "record")
+    return Staged(sizes, digests, remote, before, frozenset(copied)), records
 
 
 def write_shard(
@@ -293,7 +293,7 @@ def _runs(path: Path, group: str, new: NextStore) -> Runs:
     spans = (
         Run(ends[k], ends[k + 1], row.store, before[row.store][row.row] - ends[k])
         for k, row in enumerate(new.rows)
-        if not row.spooled and alike[row.store] and (row.names is None or group != "record")
+        if not row.spooled and alike[row.store] and not (row.names and group == "record")
     )
     return runs_of(spans, ends[-1], tuple(rows[-1] for rows in before))
 
@@ -306,12 +306,10 @@ def _packs_alike(path: Path, group: str, new: NextStore, source: SourceStore) ->
     return all(packing_of(path / name) == packing_of(source.path / name) for name in held)
 
 
-def _taken(
-    path: Path, new: NextStore, runs: Mapping[str, Runs]
-) -> tuple[frozenset[tuple[str, int]], frozenset[int]]:
+def _taken(new: NextStore, runs: Mapping[str, Runs]) -> set[tuple[str, int]]:
     """Return the shards, by group and number, that are files of the store that is replaced."""
     if not (new.replaces and new.stores):
-        return frozenset(), frozenset()
+        return set()
     held, taken = new.stores[0].store, set()
     for group, (_, rows) in cuts_of(new.parameters, new.offsets[-1]).items():
         names = arrays_in(group, new.merged)
@@ -321,10 +319,10 @@ def _taken(
             run = runs[group].holds(number * rows, (number + 1) * rows)
             if run is not None and run.shift == 0:
                 taken.add((group, number))
-    return frozenset(taken), frozenset(number for group, number in taken if group == "record")
+    return taken
 
 
-def _take(path: Path, new: NextStore, taken: frozenset[tuple[str, int]]) -> dict[str, Written]:
+def _take(path: Path, new: NextStore, taken: Collection[tuple[str, int]]) -> dict[str, Written]:
     """Give the new store those shards; on an object store they are named alone.
 
     There the server copies them when the others are uploaded.

@@ -87,7 +87,7 @@ class Reopened:
         )
         key = hashlib.sha256(to_json(record)).hexdigest()
         put = self._spool.put(replace(record, key=key), self.field, self.latents, annotation)
-        return replace(put, damaged=self._asset.damaged)
+        return replace(put, damaged=self._asset.damaged, seen=self._asset.seen)
 
 
 def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> list[Row]:

@@ -1,6 +1,6 @@
 """What a build will do with each asset, and why, before it does it.
 
-Sources are compared by content, but for those that the last build (`slatprep.pipeline.before`) has
+Sources are compared by content, but for those that the last build (`slatprep.pipeline.seen`) has
 seen as they are.
 """
 
@@ -10,18 +10,20 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from types import MappingProxyType
 
 from slatprep.errors import SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.before import as_read
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import Names, SourceStore
+from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers import hash_sources
 from slatprep.records import AssetPair, Place, SourceFile
 from slatprep.storage.faults import reached
 from slatprep.storage.states import noting
+from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import RecordError
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most, run_unordered
@@ -113,10 +115,10 @@ class PlannedAsset:
         Why, in one line.
     key : str
         See `slatprep.pipeline.recipe`; empty where the sources cannot be read.
-    names : Names or None
-        Where its record has other ones: its category, paths of its files.
+    names : mapping of str to object, or None
+        Those that its record has otherwise, such as its category or the paths of its files.
     seen : bytes
-        State of its sources as they were hashed; empty where they were not.
+        State of its sources as they were hashed; empty where nobody looked.
     """
 
     asset_id: str
@@ -156,30 +158,31 @@ def plan_assets(
     pairs: Sequence[AssetPair],
     context: BuildContext,
     crew: Crew,
-    known: Mapping[str, str] = MappingProxyType({}),
-) -> list[PlannedAsset]:
-    """Say what will be done with each asset, and why, by id; those to be removed as well.
+    known: Mapping[str, tuple[bytes, str]] = MappingProxyType({}),
+) -> dict[str, PlannedAsset]:
+    """Say what will be done with each asset, and why, by id; with those to be removed as well.
 
-    `known` has the keys of assets whose sources need not be hashed again, by id.
+    `known` has state and key of assets whose sources need not be hashed again.
     """
-    plan = []
+    plan = {}
     other = []
     resumable = context.spool.holds_any()
     for pair in pairs:
-        key = known.get(pair.asset_id)
-        if key is None or (resumable and context.spool.find(key)):
+        state, key = known.get(pair.asset_id, (b"", ""))
+        if not key or (resumable and context.spool.find(key)):
             other.append(pair)
         else:
-            plan.append(PlannedAsset(pair.asset_id, Action.REUSE, "unchanged", key))
+            reuse = PlannedAsset(pair.asset_id, Action.REUSE, "unchanged", key, seen=state)
+            plan[pair.asset_id] = reuse
     tasks = ((pair, context) for pair in other)
     for planned in run_unordered(plan_asset, tasks, crew.of(len(pairs) - len(known))):
-        plan.append(planned)
+        plan[planned.asset_id] = planned
         if crew.progress:
             crew.progress(len(plan), len(pairs))
     gone = context.previous.ids - {pair.asset_id for pair in pairs} if context.previous else ()
     why = "no longer among the sources"
-    plan += [PlannedAsset(asset_id, Action.REMOVE, why) for asset_id in gone]
-    return sorted(plan, key=lambda asset: asset.asset_id)
+    plan |= {asset_id: PlannedAsset(asset_id, Action.REMOVE, why) for asset_id in gone}
+    return dict(sorted(plan.items()))
 
 
 def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
@@ -203,23 +206,26 @@ def _planned(
     """See `plan_asset`, of an asset whose sources have been hashed."""
     asset_id, recipe = pair.asset_id, context.recipe
     key = recipe.key(asset_id, digests)
-    names = Names(pair.object_id, pair.view, pair.category, sources)
-    found = context.spool.find(key)
-    if found is not None:
-        other = names if names.changed(found[0]) else None
-        return PlannedAsset(asset_id, Action.RESUME, "finished by an earlier build", key, other)
+    planned = partial(PlannedAsset, asset_id, key=key)
+    if found := context.spool.find(key):
+        names = names_of(pair, sources, found[0])
+        return planned(Action.RESUME, "finished by an earlier build", names=names)
     try:
         record = context.previous.record(asset_id) if context.previous else None
     except StoreError as error:
         fault = error.faults[0] if isinstance(error, RecordError) else error
-        why = f"its record cannot be read: {fault}"
-        return PlannedAsset(asset_id, Action.ALIGN, why, key)
+        return planned(Action.ALIGN, f"its record cannot be read: {fault}")
     if record is None:
-        return PlannedAsset(asset_id, Action.ALIGN, "not in the store", key)
+        return planned(Action.ALIGN, "not in the store")
     if record.key != key:
-        return PlannedAsset(asset_id, Action.ALIGN, recipe.difference(record, sources), key)
-    changed = names.changed(record)
-    if not changed:
-        return PlannedAsset(asset_id, Action.REUSE, "unchanged", key)
-    why = f"unchanged, but for {', '.join(changed)}"
-    return PlannedAsset(asset_id, Action.REUSE, why, key, names)
+        return planned(Action.ALIGN, recipe.difference(record, sources))
+    names = names_of(pair, sources, record)
+    changed = f", but for {', '.join(names)}" if names else ""
+    return planned(Action.REUSE, f"unchanged{changed}", names=names)
+
+
+def names_of(pair: AssetPair, sources: tuple[SourceFile, ...], record: AssetRecord) -> Names | None:
+    """Return what an asset and its files are called now, where its record has other names."""
+    names = {name: getattr(pair, name) for name in ("object_id", "view", "category")}
+    names["sources"] = sources
+    return {name: own for name, own in names.items() if getattr(record, name) != own} or None

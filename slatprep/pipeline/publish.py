@@ -1,4 +1,4 @@
-"""Publish a build: put its store in place, and its manifests beside it.
+"""Publish a build: put its store in place, its manifests beside it, and say what it did.
 
 The store and its records are replaced in one step, because the records are an
 array of it. The files beside it are made from them; a build that was killed before it
@@ -9,33 +9,33 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Collection, Iterable, Iterator
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.summary import BuildSummary
-from slatprep.records import Place
+from slatprep.records import Normalization, Place, Status
 from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
 from slatprep.store.reader import Store, is_store, require_outside
-from slatprep.store.record import (
-    AssetRecord,
-    BuildCounts,
-    BuildRecord,
-    FailedRecord,
-    Record,
-)
+from slatprep.store.record import BuildCounts, BuildRecord, FailedRecord
 from slatprep.store.record_json import to_json
 from slatprep.store.records import (
     ASSETS,
     BUILD,
     MAX_BUILD_BYTES,
+    SEVERAL,
     build_in,
     file_names,
     lines_of,
@@ -190,35 +190,163 @@ def _is_marked(file: Path, mark: bytes) -> bool:
         return False
 
 
-def publish_manifests(
-    store: Store,
-    summary: BuildSummary,
-    parameters: BuildParameters,
-    failed: Iterable[Record] = (),
-    standing: Collection[str] = (),
-) -> None:
-    """Write the manifests of a store that is in place: lines of its records, and `build.json`.
+PROBLEMS_LISTED = 100
+"""How many problems a summary lists; the records hold all."""
 
-    What says so already stays as it is; files named in `standing` are not looked at. `failed` are
-    the records of assets that could not go in. StoreError if the disk does not take them.
+
+@dataclass(frozen=True)
+class BuildSummary:
+    """What a build did.
+
+    Attributes
+    ----------
+    records : Place
+        The JSON Lines file of asset records; of more than 1,024 assets, what their files are
+        called, with a ``*``.
+    build_id : str
+        Id of the build, a hash of the records' content.
+    seconds : float
+        Wall clock time.
+    statuses : dict
+        Assets by status: ``ok``, ``failed``, ``skipped``.
+    verdicts : dict
+        Assets with status ``ok`` by verdict: ``good``, ``doubtful``, ``failed``.
+    n_voxels, n_valid : int
+        SLAT voxels of those assets, and how many found an annotation.
+    n_unphysical : int
+        PixieVerse voxels of those assets that no annotation was taken from, as no
+        material has their properties.
+    problems : tuple of (str, str)
+        Asset id and reason of the first `PROBLEMS_LISTED` that are not ``ok``.
+    contradicted : tuple of str
+        Ids of the first `PROBLEMS_LISTED` whose latents contradict their labels.
+    store : Place or None
+        The store; None where only alignments were written.
+    normalization : Normalization or None
+        Ranges of the properties.
+    clipped : dict
+        By property, values of ``voxel/properties`` that lay outside its range.
+    warnings : tuple of str
+        What a person should know about the dataset as a whole.
+    damaged : tuple of str
+        What of the existing store was not as it was written, and was made anew.
+    rehash_seed : int or None
+        What the share of unchanged sources was drawn with that was hashed; None if none was.
     """
-    folder, names = summary.records.parent, file_names(len(store))
+
+    records: Place
+    build_id: str
+    seconds: float
+    statuses: dict[str, int]
+    verdicts: dict[str, int]
+    n_voxels: int
+    n_valid: int
+    n_unphysical: int
+    problems: tuple[tuple[str, str], ...]
+    contradicted: tuple[str, ...] = ()
+    store: Place | None = None
+    normalization: Normalization | None = None
+    clipped: Mapping[str, int] = field(default_factory=dict)
+    damaged: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    rehash_seed: int | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every asset went in."""
+        return all(count == 0 for status, count in self.statuses.items() if status != Status.OK)
+
+
+def counts_of(
+    ids: Sequence[str], sizes: NDArray[np.int64], column: Callable[[str], NDArray[Any]]
+) -> dict[str, Any]:
+    """Count what a `BuildSummary` tells of the assets that went in, by its fields.
+
+    Of those there are ids, numbers of voxels (N,), and columns by name.
+    """
+    contradicted = sorted(ids[row] for row in np.flatnonzero(column("contradicted")).tolist())
+    return {
+        "verdicts": dict(sorted(Counter(map(str, column("verdict"))).items())),
+        "n_voxels": int(sizes.sum()),
+        "n_valid": int(np.rint(column("valid_share") * sizes).sum()),
+        "n_unphysical": int(column("unphysical").sum()),
+        "contradicted": tuple(contradicted[:PROBLEMS_LISTED]),
+    }
+
+
+def counts_in(store: Store) -> dict[str, Any]:
+    """Count what became of the assets of a store, see `counts_of`; by property what is clipped."""
+    clipped = store.column("clipped").sum(axis=0).tolist()
+    counts = counts_of(store.ids, np.diff(store.offsets), store.column)
+    return counts | {"clipped": dict(zip(store.about.property_columns, clipped, strict=True))}
+
+
+def summarise(
+    counts: Mapping[str, Any], failed: Sequence[FailedRecord], begin: float, **told: Any
+) -> BuildSummary:
+    """Say what became of the assets, by counts of those that went in."""
+    statuses = Counter(str(asset.status) for asset in failed)
+    statuses[str(Status.OK)] = sum(counts["verdicts"].values())
+    return BuildSummary(
+        seconds=time.perf_counter() - begin,
+        statuses={str(status): statuses[str(status)] for status in Status},
+        problems=tuple((asset.asset_id, asset.reason) for asset in failed[:PROBLEMS_LISTED]),
+        **counts,
+        **told,
+    )
+
+
+def publish_store(
+    place: Destination,
+    store: Store,
+    parameters: BuildParameters,
+    begin: float,
+    failed: Sequence[FailedRecord] = (),
+    standing: Collection[str] = (),
+    **told: Any,
+) -> BuildSummary:
+    """Publish a store that is in place, with its manifests; say what it holds, and what is told.
+
+    `failed` could not go in; the files named in `standing` are not looked at. StoreError if the
+    disk does not take the manifests.
+    """
+    folder, names = place.manifests(store.path), file_names(len(store))
+    summary = summarise(
+        counts_in(store),
+        failed,
+        begin,
+        records=folder / (names[0] if len(names) == 1 else SEVERAL),
+        build_id=store.about.manifest,
+        store=place.out,
+        normalization=store.normalization,
+        **told,
+    )
     try:
-        looked = [(n, name) for n, name in enumerate(names) if name not in standing]
-        written = [_write(folder / name, lines_of(store, n)) for n, name in looked]
         record = build_record(store, summary, parameters, failed)
-        if any(written) or not _is_there(folder, record):
-            reached("manifests written", str(folder))
-            _write(folder / BUILD, to_json(record, indent=True) + b"\n")
-            reached("manifests published", str(folder))
-        if (local := storage_of(folder).local) is not None:
-            for file in stale_files(local, names):
-                file.unlink()
+        _write_manifests(folder, store, record, standing)
     except OSError as error:
         raise StoreError(
             f"{folder}: the records cannot be written there ({error.strerror or error}); the store "
             "is complete and holds those of its assets. Run again to write them here"
         ) from error
+    place.publish()
+    return summary
+
+
+def _write_manifests(
+    folder: Place, store: Store, record: BuildRecord, standing: Collection[str]
+) -> None:
+    """Write lines of a store's records, and `build.json`; what says so already stays as it is."""
+    names = file_names(len(store))
+    looked = [(n, name) for n, name in enumerate(names) if name not in standing]
+    written = [_write(folder / name, lines_of(store, n)) for n, name in looked]
+    if any(written) or not _is_there(folder, record):
+        reached("manifests written", str(folder))
+        _write(folder / BUILD, to_json(record, indent=True) + b"\n")
+        reached("manifests published", str(folder))
+    if (local := storage_of(folder).local) is not None:
+        for file in stale_files(local, names):
+            file.unlink()
 
 
 def _write(file: Place, content: bytes) -> bool:
@@ -245,38 +373,32 @@ def build_record(
     store: Store,
     summary: BuildSummary,
     parameters: BuildParameters,
-    failed: Iterable[Record] = (),
+    failed: Iterable[FailedRecord],
 ) -> BuildRecord:
-    """Return the record of a build that made a store; ValueError where it made none."""
-    if summary.store is None or summary.normalization is None:
-        raise ValueError("a build without a store has no record")
+    """Return the record of a build that made a store."""
+    voxels = summary.n_voxels, summary.n_valid, dict(summary.clipped), summary.n_unphysical
     return BuildRecord(
         id=summary.build_id,
         name=parameters.name,
         created=datetime.now(UTC).replace(microsecond=0),
         duration_s=round(summary.seconds, 3),
         platform=platform.platform(),
-        store=(storage_of(store.path).local or summary.store).name,
+        store=(storage_of(store.path).local or summary.store or store.path).name,
         records=summary.records.name,
         parameters=parameters,
         versions=store.about.build.versions,
-        normalization=summary.normalization,
+        normalization=store.normalization,
         statuses=summary.statuses,
         verdicts=summary.verdicts,
-        counts=BuildCounts(
-            summary.n_voxels,
-            summary.n_valid,
-            dict(summary.clipped),
-            summary.n_unphysical,
-        ),
+        counts=BuildCounts(*voxels),
         failed=tuple(_as_many_as_fit(failed)),
     )
 
 
-def _as_many_as_fit(failed: Iterable[Record]) -> Iterator[FailedRecord]:
+def _as_many_as_fit(failed: Iterable[FailedRecord]) -> Iterator[FailedRecord]:
     left = MAX_BUILD_BYTES // 4  # Indented, with escapes, they take more.
     for record in failed:
         left -= len(to_json(record))
-        if left < 0 or isinstance(record, AssetRecord):
+        if left < 0:
             return
         yield record

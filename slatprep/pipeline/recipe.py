@@ -22,10 +22,27 @@ import orjson
 
 from slatprep.align import engine_versions
 from slatprep.geometry.voxels import boundary
-from slatprep.parameters import BuildParameters
+from slatprep.parameters import (
+    BuildParameters,
+    NormalizeParameters,
+    is_split_file,
+    percentiles_of,
+)
 from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
-from slatprep.readers import source_digests
-from slatprep.records import AssetPair, Failed, Finished, SourceFile, Status
+from slatprep.readers import contents_of, source_digests
+from slatprep.readers.ranges import pixie_ranges, read_ranges
+from slatprep.readers.splits import read_id_file
+from slatprep.records import (
+    AssetPair,
+    Contents,
+    Failed,
+    Finished,
+    Normalization,
+    SourceFile,
+    Status,
+)
+from slatprep.storage.place import place_of
+from slatprep.store import Store
 from slatprep.store.record import (
     MAX_WARNINGS,
     AssetRecord,
@@ -78,23 +95,83 @@ class Recipe:
 
 def recipe_of(parameters: BuildParameters) -> Recipe:
     """Return the recipe of a build."""
-    return Recipe(
-        parameters=StageParameters(parameters.align, parameters.sample),
-        versions=numeric_versions(parameters),
-        code=code_fingerprint(),
-    )
-
-
-def build_of(parameters: BuildParameters) -> dict[str, Any]:
-    """Return a store's attribute ``build``: its parameters, and what else decides its bytes."""
     versions = {
-        **_environment(),
-        **numeric_versions(parameters),
-        "zarr": metadata.version("zarr"),
-        "joblib": metadata.version("joblib"),
-        "packing": packing_fingerprint(),
+        "numpy": metadata.version("numpy"),
+        "scipy": metadata.version("scipy"),
+        **engine_versions(parameters.align),
     }
-    return origin(parameters, versions)
+    stages = StageParameters(parameters.align, parameters.sample)
+    return Recipe(stages, versions, code_fingerprint())
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a build is asked for.
+
+    Attributes
+    ----------
+    parameters : BuildParameters
+        Sources and methods.
+    recipe : Recipe
+        What decides an asset's row.
+    build : mapping
+        What decides the store's bytes besides, as its attribute ``build`` says it.
+    ranges : Normalization or str
+        Ranges that do not depend on the dataset, or where those of the dataset come from.
+    declared : Contents
+        What the sources hold.
+    compact : bool
+        Rows by id, whatever the order of the existing store.
+    """
+
+    parameters: BuildParameters
+    recipe: Recipe
+    build: Mapping[str, object]
+    ranges: Normalization | str
+    declared: Contents
+    compact: bool
+
+    @classmethod
+    def of(cls, parameters: BuildParameters, compact: bool = False) -> Wanted:
+        """Return what parameters ask for; raise `SlatprepError` if their files cannot be used."""
+        declared = contents_of(parameters)
+        ranges = _ranges_of(parameters.normalize, declared)
+        recipe = recipe_of(parameters)
+        others = {name: metadata.version(name) for name in ("zarr", "joblib")}
+        versions = {**_environment(), **recipe.versions, **others, "packing": packing_fingerprint()}
+        return cls(parameters, recipe, origin(parameters, versions), ranges, declared, compact)
+
+    @property
+    def passes(self) -> bool:
+        """Whether passes over the whole dataset may place assets anew."""
+        return self.parameters.consensus.settle or self.parameters.witness.settle
+
+    def has_ranges(self, store: Store) -> bool:
+        """Whether a store of the right assets has the ranges that are asked for."""
+        return self.ranges in (store.normalization, store.normalization.source)
+
+    def allows(self, store: Store) -> bool:
+        """Whether a store of the right assets is the one that is asked for."""
+        compact = len(store.attributes["segments"]) <= 1 or not self.compact
+        return store.attributes["build"] == self.build and self.has_ranges(store) and compact
+
+
+def _ranges_of(parameters: NormalizeParameters, declared: Contents) -> Normalization | str:
+    """Return ranges that do not depend on the dataset, or else where those of it come from.
+
+    That is a word that changes when they would. InputError if a file cannot be used.
+    """
+    ranges, by = parameters.ranges, parameters.split_by
+    if ranges == "pixie":
+        return pixie_ranges(declared.properties)
+    if ranges != "dataset" and not percentiles_of(ranges):
+        return read_ranges(place_of(ranges), declared.properties)
+    if parameters.objects == "all":
+        return ranges
+    if is_split_file(by):
+        digest = hashlib.sha256(read_id_file(place_of(by))).hexdigest()
+        by = f"{place_of(by).name}, sha256 {digest[:12]}"
+    return f"{ranges} of train by {by}"
 
 
 def origin(parameters: BuildParameters, versions: Mapping[str, str]) -> dict[str, Any]:
@@ -103,15 +180,6 @@ def origin(parameters: BuildParameters, versions: Mapping[str, str]) -> dict[str
     said = {group: getattr(parameters, group) for group in groups}
     document = {"name": parameters.name, "parameters": said, "versions": versions}
     return dict(orjson.loads(orjson.dumps(document)))
-
-
-def numeric_versions(parameters: BuildParameters) -> dict[str, str]:
-    """Return the versions of the libraries that make an asset's numbers."""
-    return {
-        "numpy": metadata.version("numpy"),
-        "scipy": metadata.version("scipy"),
-        **engine_versions(parameters.align),
-    }
 
 
 @lru_cache(maxsize=1)  # It takes longer than to read an asset.

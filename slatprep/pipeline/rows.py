@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from typing import Any
@@ -20,13 +20,13 @@ from slatprep.errors import StoreError
 from slatprep.geometry.deformation import map_of
 from slatprep.normalize import normalize_change
 from slatprep.parameters import StoreParameters
-from slatprep.records import Contents, Finished, LatentMoments, Normalization, Place, SourceFile
+from slatprep.records import Contents, Finished, LatentMoments, Normalization, Place
 from slatprep.store.attributes import store_attributes
 from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.layout import RECORD_ARRAY, RECORDS_IN_SHARD
-from slatprep.store.reader import Store, is_store, open_store
+from slatprep.store.reader import Store, open_store
 from slatprep.store.record import AssetRecord
-from slatprep.store.record_json import build_id_of, digest_of, read_asset_record, to_json
+from slatprep.store.record_json import build_id_of, digest_of, to_json
 from slatprep.store.records import StoredRecords
 from slatprep.store.shard_writer import Written
 from slatprep.workers.local import Jobs
@@ -133,34 +133,22 @@ def _in_this_process(path: Place, damaged: frozenset[str], run: str) -> SourceSt
     return SourceStore(path, damaged)
 
 
-def store_there(target: Place) -> SourceStore | None:
-    """Return the store at a path, none of its files compared; None where none can be opened."""
-    try:
-        return SourceStore(open_store(target).path)
-    except StoreError:
-        return None
-
-
 def checked_store(
-    target: Place, jobs: Jobs, below: str = ""
+    source: SourceStore, jobs: Jobs, below: str = ""
 ) -> tuple[SourceStore | None, tuple[str, ...]]:
-    """Return the store at a path, None where no build can go on from it, and what is wrong.
+    """Return the store, None where no build can go on from it, and what is wrong.
 
     Its metadata are held against the contract, and the files whose names begin with `below`
     against their digests; of the others the sizes are compared. What is wrong is in words,
     sorted by file.
     """
-    try:
-        store = open_store(target)
-    except StoreError as error:
-        return None, (str(error),) if is_store(target) else ()
-    findings = sorted({*metadata_findings(store.path), *file_findings(store, jobs, below)[1]})
-    damaged = tuple(map(str, findings))
+    findings = {*metadata_findings(source.path), *file_findings(source.store, jobs, below)[1]}
+    damaged = tuple(map(str, sorted(findings)))
     files = frozenset(finding.file for finding in findings)
     if any(file.startswith(_NEEDED) for file in files):
         return None, damaged
     records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
-    return SourceStore(store.path, records), damaged
+    return SourceStore(source.path, records), damaged
 
 
 IN_SPOOL = -1
@@ -171,23 +159,8 @@ MOST_BEHIND = 0.1
 there takes a tenth of the time that a new asset takes."""
 
 
-@dataclass(frozen=True, slots=True)
-class Names:
-    """What an asset and its files are called now: no part of the work."""
-
-    object_id: str
-    view: str
-    category: str
-    sources: tuple[SourceFile, ...]
-
-    def changed(self, record: AssetRecord) -> list[str]:
-        """Return the names of the fields in which a record differs."""
-        names = (field.name for field in fields(self))
-        return [name for name in names if getattr(record, name) != getattr(self, name)]
-
-    def applied(self, record: AssetRecord) -> AssetRecord:
-        """Return a record with these names."""
-        return replace(record, **{field.name: getattr(self, field.name) for field in fields(self)})
+Names = Mapping[str, Any]
+"""What an asset and its files are called now, by field of its record; no part of the work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,8 +183,8 @@ class Row:
         Which of the stores that rows are taken from has it; `IN_SPOOL` where none.
     row : int
         Its row there.
-    names : Names or None
-        Where its record there has other ones.
+    names : mapping of str to object, or None
+        Those that its record there has otherwise.
     damaged : str
         Why, in words, what an older store holds of it was not taken over.
     seen : bytes
@@ -282,6 +255,11 @@ class NextStore:
     replaces: bool = False
 
     @cached_property
+    def ids(self) -> list[str]:
+        """Ids of its assets."""
+        return [row.asset_id for row in self.rows]
+
+    @cached_property
     def offsets(self) -> list[int]:
         """First row of each asset in ``voxel/*``, and the last one's end."""
         return [0, *accumulate(row.n_voxels for row in self.rows)]
@@ -296,7 +274,7 @@ class NextStore:
         """SHA-256 of the record of each row, (A, 32)."""
         digests: NDArray[np.uint8] = column("record_sha256", self.rows, self.stores)
         for at, row in enumerate(self.rows):
-            if row.names is not None:
+            if row.names:
                 text = record_text(self.stores[row.store], row.row, row.names)
                 digests[at] = np.frombuffer(digest_of(text), np.uint8)
         return digests
@@ -305,37 +283,29 @@ class NextStore:
     def build_id(self) -> str:
         """The id of the build; equal ids mean the same assets, records, ranges and parameters."""
         head = store_attributes(self.normalization, self.build, self.contents)
-        ids = (row.asset_id for row in self.rows)
-        return build_id_of(head, zip(ids, map(bytes, self.digests), strict=True))
+        return build_id_of(head, zip(self.ids, map(bytes, self.digests), strict=True))
 
     def same_as(self, other: SourceStore) -> bool:
         """Whether another store is this one: the same build, in the same order of rows."""
-        ids = [row.asset_id for row in self.rows]
-        return self.build_id == other.store.about.manifest and ids == other.store.ids
+        return self.build_id == other.store.about.manifest and self.ids == other.store.ids
 
     def column(self, name: str) -> NDArray[Any]:
         """Return an ``asset/*`` array by its last name; of what packing clips, what is known."""
         if name in ("id", "offset"):
-            ids = [row.asset_id for row in self.rows]
-            return np.array(ids, object) if name == "id" else np.array(self.offsets, np.int64)
+            return np.array(self.ids, object) if name == "id" else np.array(self.offsets, np.int64)
         if name == "record_sha256":
             return self.digests
         values = column(name, self.rows, self.stores)
         if name == "property_ambiguity":
             # Of the spool in mapped units, as ranges come from the dataset.
-            at = [k for k, row in enumerate(self.rows) if self._changes(row)]
-            for k in at:
-                row = self.rows[k]
-                if not row.spooled:
-                    document = orjson.loads(self.stores[row.store].text(row.row))
-                    values[k] = document["judgement"]["ambiguity"]["property_change"]
+            other = [source.normalization != self.normalization for source in self.stores]
+            at = [k for k, row in enumerate(self.rows) if row.spooled or other[row.store]]
+            for k, row in ((k, self.rows[k]) for k in at if not self.rows[k].spooled):
+                document = orjson.loads(self.stores[row.store].text(row.row))
+                values[k] = document["judgement"]["ambiguity"]["property_change"]
             if at:
                 values[at] = normalize_change(values[at], self.normalization)
         return values
-
-    def _changes(self, row: Row) -> bool:
-        """Whether a row's values are to be brought to the ranges."""
-        return row.spooled or self.stores[row.store].normalization != self.normalization
 
 
 def column(name: str, rows: Sequence[Row], stores: Sequence[SourceStore]) -> NDArray[Any]:
@@ -355,18 +325,16 @@ def column(name: str, rows: Sequence[Row], stores: Sequence[SourceStore]) -> NDA
     for at, own in parts:
         values[at] = own
     for k, row in enumerate(rows):
-        if row.names is not None and name in ("object_id", "view", "category"):
-            values[k] = getattr(row.names, name)
+        if row.names and name in row.names:
+            values[k] = row.names[name]
     return values
 
 
 def record_text(source: SourceStore, row: int, names: Names | None) -> bytes:
     """Return the record of a row of a store, with other names where there are any."""
-    text = source.text(row)
-    if names is None:
-        return text
-    where = f"{source.path}: record of row {row}"
-    return to_json(names.applied(read_asset_record(text, where)))
+    if names:
+        return to_json(replace(source.records.read(row), **names))
+    return source.text(row)
 
 
 def in_order(rows: Sequence[Row], previous: SourceStore | None, compact: bool) -> list[Row]:

@@ -10,10 +10,9 @@ from slatprep.errors import ConfigError
 from slatprep.normalize import ranges_from_extents
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
-from slatprep.pipeline.notices import counts_of, nothing_usable, wild_ranges
+from slatprep.pipeline.notices import nothing_usable, wild_ranges
+from slatprep.pipeline.publish import BuildSummary, counts_of, summarise
 from slatprep.pipeline.recipe import recipe_of, record_of_failed
-from slatprep.pipeline.rows import Row
-from slatprep.pipeline.summary import summarise
 from slatprep.records import AssetPair, Failed, SourceRoots, Status
 from slatprep.store.record import FailedRecord
 
@@ -86,15 +85,20 @@ def failed(number: int, status: Status = Status.FAILED) -> FailedRecord:
     return record_of_failed(Failed(pair, status, f"reason {number}"), recipe_of(PARAMETERS))
 
 
-def finished(name: str, verdict: str) -> Row:
-    columns = {"verdict": verdict, "unphysical": 4, "contradicted": name == "y", "valid_share": 0.7}
-    return Row(name, 10, columns=columns)
+def summed_up(without: list[FailedRecord], **verdicts: str) -> BuildSummary:
+    columns = {
+        "verdict": list(verdicts.values()),
+        "unphysical": np.full(len(verdicts), 4),
+        "contradicted": np.array([name == "y" for name in verdicts]),
+        "valid_share": np.full(len(verdicts), 0.7),
+    }
+    counts = counts_of(list(verdicts), np.full(len(verdicts), 10), columns.__getitem__)
+    return summarise(counts, without, 0.0, records=Path("r"), build_id="id")
 
 
 def test_assets_are_counted_and_the_first_hundred_problems_listed():
-    usable = [finished("x", "good"), finished("y", "doubtful"), finished("z", "good")]
     without = [*map(failed, range(120)), failed(120, Status.SKIPPED)]
-    summary = summarise(counts_of(usable), without, Path("r"), "id", 1.0)
+    summary = summed_up(without, x="good", y="doubtful", z="good")
     assert summary.statuses == {"ok": 3, "failed": 120, "skipped": 1}
     assert summary.verdicts == {"doubtful": 1, "good": 2}
     assert (summary.n_voxels, summary.n_valid) == (30, 21)
@@ -103,8 +107,7 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed():
     assert summary.problems[0] == ("a000", "reason 0")
     assert len(summary.problems) == 100
     assert not summary.complete
-    clean = summarise(counts_of(usable[-1:]), [], Path("r"), "id", 1.0)
-    assert clean.complete
+    assert summed_up([], z="good").complete
 
 
 def test_nothing_usable_names_five_and_counts_the_rest():

@@ -19,7 +19,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline import recipe, rows
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.pipeline.rows import checked_store
+from slatprep.pipeline.rows import SourceStore
 from slatprep.storage import states
 from slatprep.store import layout, open_store
 from slatprep.store.shard_reader import RowReader
@@ -371,7 +371,7 @@ def test_a_worker_that_lives_on_reads_the_store_of_today(built):
     build_store(dataset.parameters(), out)
 
     def in_the_worker() -> list[str]:
-        there = checked_store(out, 1)[0]
+        there = SourceStore(out)
         worker = pickle.loads(pickle.dumps(there))
         ids = worker.store.ids
         assert [worker.store.asset(one).asset_id for one in ids] == list(ids)

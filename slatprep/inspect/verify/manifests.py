@@ -11,8 +11,8 @@ import orjson
 from slatprep.errors import StoreError
 from slatprep.inspect.verify.assets import fault_findings
 from slatprep.pipeline.join import APART, NO_ROOT
+from slatprep.pipeline.publish import counts_in
 from slatprep.pipeline.recipe import origin
-from slatprep.pipeline.summary import counts_in
 from slatprep.readers.published import locate_grids
 from slatprep.records import Place, SourceRoots, Status
 from slatprep.storage.place import storage_of
@@ -116,15 +116,13 @@ def manifest_findings(
 def _claims(build: BuildRecord, store: Store) -> Iterator[tuple[str, object, object]]:
     """Yield the name of each entry that the store tells too, its value here and there."""
     counts = counts_in(store)
-    yield "verdicts", build.verdicts, counts.verdicts
+    yield "verdicts", build.verdicts, counts["verdicts"]
     ok = build.statuses.get(str(Status.OK))
     yield "statuses/ok", ok, len(store)
     yield "counts/voxels", build.counts.voxels, store.shape("voxel/coords")[0]
-    yield "counts/valid", build.counts.valid, counts.n_valid
-    yield "counts/unphysical", build.counts.unphysical, counts.n_unphysical
-    clipped = store.column("clipped").sum(axis=0).tolist()
-    held = dict(zip(store.about.property_columns, clipped, strict=True))
-    yield "counts/clipped", build.counts.clipped, held
+    yield "counts/valid", build.counts.valid, counts["n_valid"]
+    yield "counts/unphysical", build.counts.unphysical, counts["n_unphysical"]
+    yield "counts/clipped", build.counts.clipped, counts["clipped"]
     yield "normalization", build.normalization, store.normalization
     said = {**origin(build.parameters, build.versions), "name": build.name}
     for name, value in store.attributes["build"].items():
