@@ -45,7 +45,7 @@ from slatprep.cli.commands import slatprep
 from slatprep.errors import SlatprepError, StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.inspect.verify.manifests import manifest_findings
-from slatprep.pipeline import before
+from slatprep.pipeline import seen
 from slatprep.pipeline.dataset import build_store
 from slatprep.storage.files import local_files
 from slatprep.store import open_store
@@ -152,9 +152,9 @@ def flip(bench: Bench, number: int) -> None:
         if found and number % WHOLE_EVERY == 0:
             bench.told["found, and the next build"] += 1
             heal(bench, what, verified=True)
-        if file.name == before.NAME:  # It tells a build what not to hash, and nothing else.
-            believed = before.read_seen(bench.manifests, content[32:64])
-            if number % SEEN_EVERY == 0 or believed.keys:
+        if file.name == seen.NAME:  # It tells a build what not to hash, and nothing else.
+            believed, _ = seen.read_seen(bench.manifests, content[32:64])
+            if number % SEEN_EVERY == 0 or believed:
                 heal(bench, what, verified=False)
             outcome = "costs the next build some hashing"
         else:

@@ -76,7 +76,7 @@ def timed(name, stage):
 def now():
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return f"{time.perf_counter():.0f} s, {pages * 4096 / 1e6:.0f} MB"
-for name in ("_discover", "_plan", "finish", "settle_rows", "pack_store", "_publish"):
+for name in ("_discover", "plan_assets", "finish", "settle_rows", "pack_store", "_publish"):
     setattr(dataset, name, timed(name.strip("_"), getattr(dataset, name)))
 def progress(done, count):
     if done % 20_000 == 0:

@@ -5,7 +5,7 @@ Where there are several, each is aligned by itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,15 +103,17 @@ def process_several(
     lacks = {one.pair.sample: lacking(one.field, contents) for one in good}
     first = next((one for one in good if not lacks[one.pair.sample]), None)
     if first is None:
-        raise _incomplete(pair, lacks, faults)
+        what = "no annotation with all that the store holds can be used"
+        reasons = [f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items()]
+        reasons += [f"sample {sample}: {error}" for sample, error in faults.items()]
+        raise _unusable(pair, what, reasons, "one that can be, to which others add")
     good = [first, *(one for one in good if one is not first)]
     parts = [in_table(one.annotation, one.field, contents) for one in good]
     annotation = merge(parts, contents.properties)
-    told = {one.pair.sample: one for one in annotated}
-    contributions = tuple(
-        _contribution(one, told.get(one.sample), faults.get(one.sample), good, sources)
-        for one in pair.annotations
-    )
+    whys = {sample: " ".join(str(fault).split()) for sample, fault in faults.items()}
+    told = {sample: Contribution(sample, (), why) for sample, why in whys.items()}
+    told |= {one.pair.sample: _contribution(one, one in good, sources) for one in annotated}
+    contributions = tuple(told[one.sample] for one in pair.annotations)
     return Finished(
         pair,
         replace(first.field, warnings=_warnings(good, lacks, contributions)),
@@ -156,7 +158,11 @@ def _annotations(
         judgement = found.judgement if found else None
         annotated.append(annotate(one, field, latents, parameters, alignment, judgement))
     if latents is None:
-        raise _refused(pair, faults)
+        if len(set(map(str, faults.values()))) == 1:
+            raise next(iter(faults.values()))
+        what = f"none of its {len(faults)} annotations can be used"
+        reasons = [f"sample {sample}: {error}" for sample, error in faults.items()]
+        raise _unusable(pair, what, reasons, "one that can be")
     return latents, annotated, faults
 
 
@@ -173,16 +179,8 @@ def _warnings(
     )
 
 
-def _incomplete(
-    pair: AssetPair, lacks: Mapping[str, tuple[str, ...]], faults: Mapping[str, InputError]
-) -> InputError:
-    reasons = [f"sample {sample} has no {', '.join(names)}" for sample, names in lacks.items()]
-    reasons += [f"sample {sample}: {error}" for sample, error in faults.items()]
-    return InputError(
-        f"asset {pair.asset_id!r}",
-        f"no annotation with all that the store holds can be used ({'; '.join(reasons)})",
-        "one that can be, to which others add",
-    )
+def _unusable(pair: AssetPair, what: str, reasons: Iterable[str], wanted: str) -> InputError:
+    return InputError(f"asset {pair.asset_id!r}", f"{what} ({'; '.join(reasons)})", wanted)
 
 
 def _replaced(one: AssetPair) -> InputError:
@@ -199,27 +197,8 @@ def _same_alignment(field: MaterialField, annotated: list[Annotated]) -> Alignme
     return None
 
 
-def _contribution(
-    pair: AssetPair,
-    annotated: Annotated | None,
-    fault: InputError | None,
-    good: list[Annotated],
-    sources: tuple[SourceFile, ...],
-) -> Contribution:
-    if annotated is None:
-        return Contribution(pair.sample, (), " ".join(str(fault).split()))
-    left_out = (
-        "" if annotated in good else f"its alignment failed: {annotated.judgement.reasons[0]}"
-    )
-    files = tuple(k for k, file in enumerate(sources) if file in annotated.field.sources)
-    return Contribution(pair.sample, files, left_out, annotated.alignment, annotated.judgement)
-
-
-def _refused(pair: AssetPair, faults: dict[str, InputError]) -> InputError:
-    """Return why none of the annotations can be used; one reason where all have the same."""
-    first, *others = faults.values()
-    if all(str(other) == str(first) for other in others):
-        return first
-    reasons = "; ".join(f"sample {sample}: {error}" for sample, error in faults.items())
-    what = f"none of its {len(faults)} annotations can be used ({reasons})"
-    return InputError(f"asset {pair.asset_id!r}", what, "one that can be")
+def _contribution(one: Annotated, is_good: bool, sources: tuple[SourceFile, ...]) -> Contribution:
+    """Return what became of an annotation that can be used."""
+    left_out = "" if is_good else f"its alignment failed: {one.judgement.reasons[0]}"
+    files = tuple(k for k, file in enumerate(sources) if file in one.field.sources)
+    return Contribution(one.pair.sample, files, left_out, one.alignment, one.judgement)

@@ -9,14 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.before import SHARE, Before, look_back
-from slatprep.pipeline.decoys import DECOYS, EVERY, measure_build
+from slatprep.pipeline.decoys import DECOYS, measure_build
 from slatprep.pipeline.notices import dataset_notices
 from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.plan import (
@@ -40,7 +39,7 @@ from slatprep.pipeline.recipe import Wanted, recipe_of
 from slatprep.pipeline.rows import NextStore, Row
 from slatprep.pipeline.settle import check_objects, kept_rows, settle_rows
 from slatprep.pipeline.spool import Spool
-from slatprep.pipeline.work import Work, spool_of, work_beside, work_directory
+from slatprep.pipeline.work import spool_of, work_beside, work_directory
 from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Place
@@ -153,16 +152,18 @@ def build_store(
             return _publish(before, begin)
         before.check(crew.of(len(pairs)))
         context = BuildContext(parameters, wanted.recipe, work.spool, before.previous, strict)
-        plan = _plan(pairs, context, crew, before.known)
+        plan = plan_assets(pairs, context, crew, before.known)
         assets = _finish_all(pairs, plan, context, crew, None if keep_work else before)
         new, failed = settle_rows(assets, before, context, crew)
-        records = _pack(work, before, new, crew)
+        records, spooled = None, sum(row.spooled for row in new.rows)
+        if not before.holds(new):
+            records = pack_store(work, place, new, crew.of(spooled))
         summary = _publish(before, begin, new, records, failed)
         if keep_work:
             work.keep_only({row.key for row in new.rows if row.spooled})
         if records is not None:
             aligned = sum(plan[one].action is not Action.REUSE for one in new.ids)
-            _measure(before, aligned, decoys, crew)
+            measure_build(open_store(place.in_place()), aligned, decoys, crew, before.previous)
     return summary
 
 
@@ -213,20 +214,6 @@ def finish(
     return assets
 
 
-def _pack(work: Work, before: Before, new: NextStore, crew: Crew) -> frozenset[int] | None:
-    """See `pack_store`; None where the store that is there is the same."""
-    if before.holds(new):
-        return None
-    return pack_store(work, before.place, new, crew.of(sum(row.spooled for row in new.rows)))
-
-
-def _measure(before: Before, aligned: int, most: int, crew: Crew) -> None:
-    """Measure the errors of the store that is in place now on at most so many decoys."""
-    store, there = open_store(before.place.in_place()), before.previous
-    jobs = crew.of(aligned // EVERY)
-    measure_build(store, aligned, most, jobs, there.path if there else None, crew.note)
-
-
 def plan_build(
     parameters: BuildParameters,
     out: str | Place,
@@ -245,7 +232,7 @@ def plan_build(
     before = look_back(place, pairs, wanted, crew, fresh, float(rehash))
     before.check(jobs)
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
-    plan = plan_assets(pairs, context, crew, before.known)
+    plan = plan_assets(pairs, context, crew, before.known, ahead=True)
     return BuildPlan(place.out, tuple(plan.values()), before.damaged)
 
 
@@ -272,7 +259,7 @@ def align_pairs(
     with work_beside(out.absolute(), arrays=False) as work:
         context = BuildContext(parameters, recipe_of(parameters), work.spool, None, strict)
         pairs = _discover(parameters, jobs, work.scratch, note=note)
-        plan = _plan(pairs, context, crew)
+        plan = plan_assets(pairs, context, crew)
         assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
         digests = []
         with writing(str(out), out.parent), staged(out) as partial, partial.open("wb") as file:
@@ -303,18 +290,6 @@ def _discover(
     sources = next(([pair.grid, pair.slat] for pair in pairs if pair.grid and pair.slat), [])
     require_shared(jobs, [*shared, *sources])
     return pairs
-
-
-def _plan(
-    pairs: Sequence[AssetPair],
-    context: BuildContext,
-    crew: Crew,
-    known: Mapping[str, tuple[bytes, str]] = MappingProxyType({}),
-) -> dict[str, PlannedAsset]:
-    """Return what is to be done by asset id: everything, where nothing was done before."""
-    if context.previous is None and not context.spool.holds_any():
-        return {p.asset_id: PlannedAsset(p.asset_id, Action.ALIGN, "new") for p in pairs}
-    return plan_assets(pairs, context, crew, known)
 
 
 def _publish(

@@ -8,7 +8,7 @@ mostly those of before, and what was measured of them is taken over.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.judge.verdict import LEAST_TARGETS
+from slatprep.pipeline.plan import Crew
+from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Engine, Number, Place, Share, Verdict
 from slatprep.storage.atomic import writing
 from slatprep.storage.documents import read_bounded
@@ -253,12 +255,7 @@ def measure_errors(
 
 
 def measure_build(
-    store: Store,
-    aligned: int,
-    most: int,
-    jobs: Jobs,
-    before: Place | None = None,
-    note: Callable[[str], None] | None = None,
+    store: Store, aligned: int, most: int, crew: Crew, before: SourceStore | None
 ) -> None:
     """Measure the errors of a store that a build has just written, within `EVERY`.
 
@@ -266,17 +263,16 @@ def measure_build(
     store that it replaces. Where these allow no decoy, what was measured before stands, and
     `told_of` says that it is of before.
     """
-    measured = measured_errors(store.path) or (measured_errors(before) if before else None)
+    measured = measured_errors(store.path) or (measured_errors(before.path) if before else None)
     new = min(aligned // EVERY, most)
     if new == 0 or len(store) < LEAST_TARGETS or _no_decoys(store):
         if measured:
             _write(store, measured)
         return
-    if note:
-        note(f"measuring errors on at most {new:,} new decoys")
+    crew.tell(f"measuring errors on at most {new:,} new decoys")
     # As many as were asked for by hand are kept.
     count = max(min(len(store) // EVERY, most), len(measured.decoys) if measured else 0)
-    seed = measured.seed if measured else 0
+    seed, jobs = measured.seed if measured else 0, crew.of(aligned // EVERY)
     measure_errors(store, count, seed, jobs, most_new=new, before=measured)
 
 
@@ -357,9 +353,8 @@ def align_decoy(
 
 def measured_errors(store: Place) -> MeasuredErrors | None:
     """Return what was measured of a store, or of what it was before an update; None if nothing."""
-    file = manifests_of(store) / FILE
     try:
-        text = read_bounded(file, _MAX_BYTES)
+        text = read_bounded(manifests_of(store) / FILE, _MAX_BYTES)
         found: MeasuredErrors = adapter_of(MeasuredErrors).validate_json(text, strict=True)
     except (OSError, ValueError):
         return None  # They are measured anew.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -60,23 +60,20 @@ def packing_fingerprint() -> str:
 
     Rows that other code packed are packed anew, but their assets are not aligned again.
     """
-    digest = hashlib.sha256()
-    for name in PACKING:
-        path = _source(name)
-        if path is None:
-            raise ValueError(f"{name} is no module of slatprep")
-        digest.update(f"{_dump(_parsed(path.read_bytes()))}\n".encode())
-    return digest.hexdigest()[:16]
+    return _digest_of(map(_module, PACKING))[:16]
 
 
 @lru_cache(maxsize=1)
 def code_fingerprint() -> str:
     """Return the SHA-256, in hex, of the statements of `numeric_modules`."""
-    digest = hashlib.sha256()
-    for path in numeric_modules().values():
-        digest.update(f"{_dump(_parsed(path.read_bytes()))}\n".encode())
+    digest = _digest_of(numeric_modules().values())
     _parsed.cache_clear()  # Trees are large.
-    return digest.hexdigest()
+    return digest
+
+
+def _digest_of(modules: Iterable[Path]) -> str:
+    lines = (f"{_dump(_parsed(path.read_bytes()))}\n" for path in modules)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def numeric_modules() -> dict[str, Path]:
@@ -86,13 +83,10 @@ def numeric_modules() -> dict[str, Path]:
     while waiting:
         name = waiting.pop()
         carries = name.startswith("slatprep.storage") and name not in _DECODING
-        if name in found or name in _NOT_NUMBERS or carries:
+        # What is no module is a name inside one, as `from slatprep.records import Verdict` has.
+        path = _module(name) if name in STAGES else _source(name)
+        if name in found or name in _NOT_NUMBERS or carries or path is None:
             continue
-        path = _source(name)
-        if path is None:
-            if name in STAGES:
-                raise ValueError(f"the stage {name} is no module of slatprep")
-            continue  # A name inside a module, as `from slatprep.records import Verdict` has.
         found[name] = path
         if path.name == "__init__.py":
             waiting += [f"{name}.{module.stem}" for module in path.parent.glob("[!_]*.py")]
@@ -100,10 +94,16 @@ def numeric_modules() -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
+def _module(name: str) -> Path:
+    path = _source(name)
+    if path is None:
+        raise ValueError(f"{name} is no module of slatprep")
+    return path
+
+
 def _source(name: str) -> Path | None:
     # Not by importlib, which would import, and compile, what a name is looked for in.
-    package = Path(__file__).parents[1]
-    place = package.joinpath(*name.split(".")[1:])
+    place = Path(__file__).parents[1].joinpath(*name.split(".")[1:])
     files = (place.with_name(f"{place.name}.py"), place / "__init__.py")
     return next((file for file in files if file.is_file()), None)
 
@@ -111,7 +111,13 @@ def _source(name: str) -> Path | None:
 @lru_cache(maxsize=256)
 def _parsed(text: bytes) -> ast.Module:
     """Return a module without its docstrings, which is asked for twice."""
-    return _without_docstrings(ast.parse(text))
+    tree = ast.parse(text)
+    for node in _statements(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            first = node.body[0] if node.body else None
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                node.body = node.body[1:]
+    return tree
 
 
 def _imports(path: Path) -> Iterator[str]:
@@ -144,12 +150,3 @@ def _dump(node: object) -> str:
     if isinstance(node, list):
         return f"[{', '.join([_dump(one) for one in node])}]"
     return ascii(node)  # repr() shows what this Python's edition of Unicode calls printable
-
-
-def _without_docstrings(tree: ast.Module) -> ast.Module:
-    for node in _statements(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            first = node.body[0] if node.body else None
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                node.body = node.body[1:]
-    return tree

@@ -16,35 +16,16 @@ import numpy as np
 
 from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
 from slatprep.align.settle import refit, take
-from slatprep.judge import contradicted
-from slatprep.judge.witness import (
-    LatentEvidence,
-    LatentModel,
-    Moments,
-    Reliability,
-    choice_of,
-    fit_models,
-    fold_of,
-    moments_of,
-    reliability_of,
-    weigh,
-)
+from slatprep.judge import contradicted, witness
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.annotate import look_up
 from slatprep.pipeline.plan import BuildContext, Crew
 from slatprep.pipeline.rows import Row
 from slatprep.pipeline.spool import Spool
-from slatprep.records import (
-    Alignment,
-    Annotation,
-    Consensus,
-    Judgement,
-    LatentChoice,
-    Verdict,
-)
+from slatprep.records import Alignment, Consensus, LatentChoice, Verdict
 from slatprep.store.record import FirstPass
 from slatprep.store.record_json import to_json
-from slatprep.workers.local import run_unordered
+from slatprep.workers.local import run_in_order, run_unordered
 
 
 def apply_passes(rows: list[Row], context: BuildContext, crew: Crew, labels: int) -> list[Row]:
@@ -65,28 +46,28 @@ class Reopened:
     def __init__(self, asset: Row, spool: Spool) -> None:
         self._asset, self._spool = asset, spool
         self.record, self.field = spool.record(asset.key), spool.field(asset.key)
-        self.latents, self.annotation = spool.latents(asset.key), spool.annotation(asset.key)
+        self.latents, self.annotation = spool.looked_up(asset.key)
+        self.alignment, self.judgement = self.record.alignment, self.record.judgement
 
-    def placed(
-        self, alignment: Alignment, parameters: BuildParameters
-    ) -> tuple[Alignment, Annotation, Judgement]:
+    def place(self, alignment: Alignment, parameters: BuildParameters) -> None:
         """Look up and judge under another alignment; fit it first if its placement is another."""
-        if alignment.transform is not self.record.alignment.transform:
+        if alignment.transform is not self.alignment.transform:
             alignment = refit(alignment, self.field, self.latents, parameters.align)
-        return alignment, *look_up(self.field, self.latents, alignment, parameters.sample)
+        looked_up = look_up(self.field, self.latents, alignment, parameters.sample)
+        self.alignment, (self.annotation, self.judgement) = alignment, looked_up
 
-    def put(self, alignment: Alignment, annotation: Annotation, judgement: Judgement) -> Row:
-        """Write the asset with these beside itself; return what the parent keeps."""
+    def put(self) -> Row:
+        """Write the asset as it is now beside itself; return what the parent keeps."""
         first = self.record
         record = replace(
             first,
-            alignment=alignment,
-            judgement=judgement,
+            alignment=self.alignment,
+            judgement=self.judgement,
             first_pass=first.first_pass or FirstPass(first.key, first.alignment, first.judgement),
-            counts=replace(first.counts, valid=int(annotation.valid.sum())),
+            counts=replace(first.counts, valid=int(self.annotation.valid.sum())),
         )
         key = hashlib.sha256(to_json(record)).hexdigest()
-        put = self._spool.put(replace(record, key=key), self.field, self.latents, annotation)
+        put = self._spool.put(replace(record, key=key), self.field, self.latents, self.annotation)
         return replace(put, damaged=self._asset.damaged, seen=self._asset.seen)
 
 
@@ -107,17 +88,16 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
     tasks = ((asset, context.spool, consensus, context.parameters) for asset in (*tied, *turned))
     settled = run_unordered(settle_asset, tasks, crew.of(len(assets)))
     changed = {asset.asset_id: asset for asset in settled}
-    moved, righted = (
-        sum(
-            not np.array_equal(changed[one.asset_id].columns["transform"], one.columns["transform"])
-            for one in some
-        )
-        for some in (tied, turned)
-    )
+
+    def moved(some: list[Row]) -> int:
+        pairs = ((one.columns["transform"], changed[one.asset_id].columns["transform"])
+                 for one in some)  # fmt: skip
+        return sum(not np.array_equal(before, after) for before, after in pairs)
+
     crew.tell(
         f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "
-        f"rotation; {moved:,} of {len(tied):,} ties were given another placement by it, and "
-        f"{righted:,} of {len(turned):,} assets that were turned otherwise without a tie"
+        f"rotation; {moved(tied):,} of {len(tied):,} ties were given another placement by it, and "
+        f"{moved(turned):,} of {len(turned):,} assets that were turned otherwise without a tie"
     )
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
@@ -127,15 +107,14 @@ def settle_asset(
 ) -> Row:
     """Settle one asset's tie, or weigh its heading; return it as it was where the choice stands."""
     first = Reopened(asset, spool)
-    before = first.record.alignment
-    alignment = settle(before, first.latents, consensus)
+    field, latents, before = first.field, first.latents, first.alignment
+    alignment = settle(before, latents, consensus)
     if alignment is before:
-        alignment = turn_if_likelier(
-            before, first.field, first.latents, consensus, parameters.align
-        )
+        alignment = turn_if_likelier(before, field, latents, consensus, parameters.align)
     if alignment is before:
         return asset
-    return first.put(*first.placed(alignment, parameters))
+    first.place(alignment, parameters)
+    return first.put()
 
 
 def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: int) -> list[Row]:
@@ -146,69 +125,70 @@ def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: 
     asset without a tie is never placed anew.
     """
     spool, parameters, jobs = context.spool, context.parameters, crew.of(len(assets))
-    sure = [asset for asset in assets if asset.columns["verdict"] == Verdict.GOOD]
-    moments = dict(run_unordered(read_moments, ((asset, spool, labels) for asset in sure), jobs))
-    models = fit_models((_object_of(asset), moments[asset.asset_id]) for asset in sure)
+    objects = [str(asset.columns["object_id"]) for asset in assets]
+    good = [k for k, asset in enumerate(assets) if asset.columns["verdict"] == Verdict.GOOD]
+    moments = run_in_order(read_moments, ((assets[k], spool, labels) for k in good), jobs)
+    models = witness.fit_models((objects[k], found) for k, found in zip(good, moments, strict=True))
     if models is None:
-        crew.tell(f"witness: {len(sure):,} good assets have too few classes; latents are not used")
+        crew.tell(f"witness: {len(good):,} good assets have too few classes; latents are not used")
         return assets
-    model_of = {asset.asset_id: models[fold_of(_object_of(asset))] for asset in assets}
-    tasks = ((asset, spool, model_of[asset.asset_id], parameters) for asset in assets)
-    evidence = dict(run_unordered(weigh_asset, tasks, jobs))
-    reliability = reliability_of([evidence[asset.asset_id] for asset in sure])
-    choices = {asset.asset_id: choice_of(evidence[asset.asset_id], reliability) for asset in assets}
+    model_of = [models[witness.fold_of(object_id)] for object_id in objects]
+    tasks = ((*task, spool, parameters) for task in zip(assets, model_of, strict=True))
+    evidence = list(run_in_order(weigh_asset, tasks, jobs))
+    reliability = witness.reliability_of([evidence[k] for k in good])
+    choices = [witness.choice_of(found, reliability) for found in evidence]
     doubted = [
-        (asset, spool, choices[asset.asset_id], reliability, model_of[asset.asset_id], parameters)
-        for asset in assets
-        if choices[asset.asset_id] or evidence[asset.asset_id].gain < reliability.least_gain
+        (asset, spool, choices[k], reliability, model_of[k], parameters)
+        for k, asset in enumerate(assets)
+        if choices[k] or evidence[k].gain < reliability.least_gain
     ]
     changed = {asset.asset_id: asset for asset in run_unordered(apply_latents, doubted, jobs)}
     contradictions = sum(bool(asset.columns["contradicted"]) for asset in changed.values())
-    crew.tell(_told(reliability, choices.values(), contradictions))
+    crew.tell(_told(reliability, choices, contradictions))
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
 
-def read_moments(asset: Row, spool: Spool, labels: int) -> tuple[str, Moments]:
-    """Return an asset's id and the moments of its latents."""
+def read_moments(asset: Row, spool: Spool, labels: int) -> witness.Moments:
+    """Return the moments of an asset's latents."""
     arrays = spool.voxels(asset.key)
-    return asset.asset_id, moments_of(arrays["feats"], arrays["material"], labels)
+    return witness.moments_of(arrays["feats"], arrays["material"], labels)
 
 
 def weigh_asset(
-    asset: Row, spool: Spool, model: LatentModel, parameters: BuildParameters
-) -> tuple[str, LatentEvidence]:
-    """Return an asset's id and what its latents say of its labels."""
+    asset: Row, model: witness.LatentModel, spool: Spool, parameters: BuildParameters
+) -> witness.LatentEvidence:
+    """Return what an asset's latents say of its labels."""
     first = Reopened(asset, spool)
-    placed = first.field, first.latents, first.record.alignment, first.annotation.material
-    return asset.asset_id, weigh(*placed, model, parameters.sample)
+    placed = first.field, first.latents, first.alignment, first.annotation.material
+    return witness.weigh(*placed, model, parameters.sample)
 
 
 def apply_latents(
     asset: Row,
     spool: Spool,
     choice: tuple[int, LatentChoice] | None,
-    reliability: Reliability,
-    model: LatentModel,
+    reliability: witness.Reliability,
+    model: witness.LatentModel,
     parameters: BuildParameters,
 ) -> Row:
     """Place one asset anew as its latents ask, or mark its labels as contradicted."""
     first = Reopened(asset, spool)
-    alignment, annotation = first.record.alignment, first.annotation
-    judgement = first.record.judgement
     if choice is not None:
         number, by = choice
         # Placement 0 is the one that the asset has: it stands, and is settled now.
-        chosen = replace(alignment, settled_by=by)
+        chosen = replace(first.alignment, settled_by=by)
         if number:
-            chosen = take(alignment, number - 1, first.latents, by)
-        alignment, annotation, judgement = first.placed(chosen, parameters)
-    if model.gain(first.latents.feats, annotation.material) < reliability.least_gain:
-        judgement = contradicted(judgement)
-    return first.put(alignment, annotation, judgement)
+            chosen = take(first.alignment, number - 1, first.latents, by)
+        first.place(chosen, parameters)
+    if model.gain(first.latents.feats, first.annotation.material) < reliability.least_gain:
+        first.judgement = contradicted(first.judgement)
+    return first.put()
 
 
 def _told(
-    reliability: Reliability, choices: Iterable[tuple[int, LatentChoice] | None], contradicted: int
+    reliability: witness.Reliability,
+    choices: Iterable[tuple[int, LatentChoice] | None],
+    contradicted: int,
 ) -> str:
     """Say how reliable latents are, and what they decided."""
     agreeing, good = reliability.agreeing, reliability.witnesses
@@ -221,7 +201,3 @@ def _told(
         f"witness: {fit}; of {len(decided):,} ties that latents decide {moved:,} were given "
         f"another placement; they contradict the labels of {contradicted:,} assets"
     )
-
-
-def _object_of(asset: Row) -> str:
-    return str(asset.columns["object_id"])

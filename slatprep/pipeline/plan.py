@@ -159,14 +159,19 @@ def plan_assets(
     context: BuildContext,
     crew: Crew,
     known: Mapping[str, tuple[bytes, str]] = MappingProxyType({}),
+    *,
+    ahead: bool = False,
 ) -> dict[str, PlannedAsset]:
     """Say what will be done with each asset, and why, by id; with those to be removed as well.
 
-    `known` has state and key of assets whose sources need not be hashed again.
+    `known` has state and key of assets whose sources need not be hashed again. Where nothing was
+    done before, none are, unless it is to be said `ahead` which cannot be read.
     """
+    resumable = context.spool.holds_any()
+    if not (ahead or resumable or context.previous):
+        return {pair.asset_id: PlannedAsset(pair.asset_id, Action.ALIGN, "new") for pair in pairs}
     plan = {}
     other = []
-    resumable = context.spool.holds_any()
     for pair in pairs:
         state, key = known.get(pair.asset_id, (b"", ""))
         if not key or (resumable and context.spool.find(key)):

@@ -22,12 +22,7 @@ import orjson
 
 from slatprep.align import engine_versions
 from slatprep.geometry.voxels import boundary
-from slatprep.parameters import (
-    BuildParameters,
-    NormalizeParameters,
-    is_split_file,
-    percentiles_of,
-)
+from slatprep.parameters import BuildParameters, NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
 from slatprep.readers import contents_of, source_digests
 from slatprep.readers.ranges import pixie_ranges, read_ranges

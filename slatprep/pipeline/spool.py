@@ -79,8 +79,7 @@ class Spool:
                 "grid_voxels": field.voxels,
                 "grid_material": field.material,
                 "grid_properties": field.properties,
-                "grid_table": np.array([(one.name, one.unit) for one in field.table]),
-                "grid_log10": np.array([one.log10 for one in field.table]),
+                "grid_table": np.array([(p.name, p.unit, str(p.log10)) for p in field.table]),
                 "grid_classified": np.array(field.classified),
             }
         text = to_json(record)
@@ -145,16 +144,15 @@ class Spool:
             there = (name for name in ("coords", "feats", *_ANNOTATION) if name in arrays)
             return {name: arrays[name] for name in there}
 
-    def latents(self, key: str) -> StructuredLatents:
-        """Read an asset's SLAT, without its sources."""
-        with self._open(key) as arrays:
-            resolution = int(arrays["slat_resolution"])
-            return StructuredLatents(arrays["coords"], arrays["feats"], resolution=resolution)
-
-    def annotation(self, key: str) -> Annotation:
-        """Read what was looked up at an asset's voxels, properties in SI units."""
-        with self._open(key) as arrays:
-            return Annotation(**{name: arrays[name] for name in _ANNOTATION if name in arrays})
+    def looked_up(self, key: str) -> tuple[StructuredLatents, Annotation]:
+        """Read an asset's SLAT, without its sources, and what was looked up at its voxels."""
+        arrays = self.voxels(key)
+        with self._open(key) as file:
+            resolution = int(file["slat_resolution"])
+        latents = StructuredLatents(
+            arrays.pop("coords"), arrays.pop("feats"), resolution=resolution
+        )
+        return latents, Annotation(**arrays)
 
     def field(self, key: str) -> MaterialField:
         """Read an asset's PixieVerse field, without its sources."""
@@ -167,10 +165,7 @@ class Spool:
                 material=arrays["grid_material"],
                 properties=arrays["grid_properties"],
                 table=tuple(
-                    Property(str(name), str(unit), bool(log10))
-                    for (name, unit), log10 in zip(
-                        arrays["grid_table"], arrays["grid_log10"], strict=True
-                    )
+                    Property(p[0], p[1], p[2] == "True") for p in arrays["grid_table"].tolist()
                 ),
                 classified=bool(arrays["grid_classified"]),
             )
