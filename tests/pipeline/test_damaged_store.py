@@ -56,6 +56,7 @@ def test_a_record_that_is_none_is_made_anew(built, undisturbed, text):
     [
         ("asset/fitness/c/0", 0),
         ("voxel/feats/c/0/0", 0),
+        ("grid/material/c/1/0/0/0", 0),
         ("asset/id/c/0", 3),
         ("asset/offset/c/0", 3),
         ("file/sha256/c/0", 3),

@@ -25,22 +25,6 @@ def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
     return dataset, tmp_path / "s.manifests" / "assets.jsonl"
 
 
-def test_a_build_through_a_link_leaves_the_records_where_the_store_lies(built, tmp_path):
-    dataset, lines = built
-    (tmp_path / "elsewhere").mkdir()
-    real, links = tmp_path / "s.zarr", [tmp_path / "other.zarr", tmp_path / "elsewhere" / "s.zarr"]
-    for seed, link in enumerate(links):
-        link.symlink_to(real)
-        dataset.add(f"new{seed}", seed)
-        summary = build_store(dataset.parameters(), link)
-        assert summary.records == lines
-        assert records.build_in(lines.parent).store == "s.zarr"
-        for place in (real, *links[: seed + 1]):
-            assert verify_store(place).ok
-            assert records.manifests_beside(place) == lines.parent
-    assert not (tmp_path / "other.manifests").exists()
-
-
 def update(dataset: Dataset, lines: Path) -> list[str]:
     """Build, and return the ids of all lines, of which `verify` finds nothing wrong."""
     out = lines.parent.with_name("s.zarr")

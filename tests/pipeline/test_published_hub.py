@@ -167,16 +167,6 @@ def test_archive_that_changes_within_a_commit_is_named(objects, hub, made, tmp_p
         pairs[0].grid.read_bytes()
 
 
-def test_truncated_archive_of_the_hub_is_named(hub, made, tmp_path):
-    root = shutil.copytree(made / "tar", tmp_path / "own")
-    path = root / "archives/render_outputs/tree.tar"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-    hub.publish(NAME, root)
-    summary = build_store(parameters(made, URL), tmp_path / "s.zarr")
-    assert "download it again" in dict(summary.problems)["tree.tar"]
-    assert IDS[0] in open_store(tmp_path / "s.zarr").ids
-
-
 def test_dataset_that_is_not_there_is_named(hub, made):
     with pytest.raises(ConfigError, match="nobody/nothing"):
         discover(parameters(made, "hf://datasets/nobody/nothing"))

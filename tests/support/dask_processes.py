@@ -6,9 +6,11 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from distributed import Client
+from distributed import Client, LocalCluster
 
 FAULTS = """
 import os, signal, time
@@ -67,6 +69,16 @@ def wait_for_workers(address: str, number: int) -> None:
     """Wait until so many workers are there: one may have been killed just now."""
     with Client(address, set_as_default=False) as client:
         client.wait_for_workers(number, timeout=900)
+
+
+@contextmanager
+def threads_for_workers(workers: int) -> Iterator[LocalCluster]:
+    """A cluster within this process, for what does not depend on its being outside."""
+    with LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=False,
+        protocol="tcp://", dashboard_address=None,
+    ) as started:  # fmt: skip
+        yield started
 
 
 class Processes:

@@ -10,13 +10,17 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from distributed import LocalCluster
 from support.commands import run
-from support.dask_processes import Processes, end, wait_for_workers, wait_until
+from support.dask_processes import (
+    Processes,
+    end,
+    threads_for_workers,
+    wait_for_workers,
+    wait_until,
+)
 from support.faults import flip
 from support.synthetic import Dataset, Made
 from support.trees import tree
@@ -66,16 +70,6 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return dataset, folder / "s.zarr"
 
 
-@contextmanager
-def threads_for_workers(workers: int) -> Iterator[LocalCluster]:
-    """A cluster within this process, for what does not depend on its being outside."""
-    with LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=False,
-        protocol="tcp://", dashboard_address=None,
-    ) as started:  # fmt: skip
-        yield started
-
-
 @pytest.fixture(scope="module")
 def threads() -> Iterator[str]:
     """Two workers within this process."""
@@ -86,10 +80,11 @@ def threads() -> Iterator[str]:
 # -- a build ----------------------------------------------------------------
 
 
-def test_a_build_whose_worker_is_killed_gives_the_same_bytes(shared, address, local, tmp_path):
+def test_a_build_whose_workers_are_killed_gives_the_same_bytes(shared, address, local, tmp_path):
     dataset, expected = local
-    faults = shared[0].folder
+    faults, once = shared[0].folder, shared[0].folder / "kill at shard filled"
     (faults / "hold-c").touch()
+    once.touch()
     parameters = dataset.root.parent / "dataset.toml"
     parameters.write_text(
         '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
@@ -112,19 +107,7 @@ def test_a_build_whose_worker_is_killed_gives_the_same_bytes(shared, address, lo
     assert told[0] == f"{address}: 3 workers"
     # Some of the made assets have one grid, of which a build tells.
     assert len(told) == 2 and "have one grid" in told[1], told
-    assert tree(tmp_path / "s.zarr") == tree(expected)
-
-
-def test_a_worker_that_is_killed_with_a_shard_open_leaves_nothing_of_it(
-    shared, address, local, tmp_path
-):
-    dataset, expected = local
-    once = shared[0].folder / "kill at shard filled"
-    once.touch()
-    with Cluster(address) as cluster:
-        summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr", jobs=cluster)
     assert not once.exists()
-    assert summary.complete
     assert tree(tmp_path / "s.zarr") == tree(expected)
     assert verify_store(tmp_path / "s.zarr").ok
 
@@ -279,33 +262,3 @@ def test_workers_compute_and_not_this_thread(threads):
         assert threading.get_ident() not in idents
         variables = [(name,) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")]
         assert list(cluster.run_unordered(os.getenv, variables)) == ["1", "1"]
-
-
-def test_short_tasks_travel_together_and_each_is_done_once(threads):
-    with Cluster(threads) as cluster:
-        results = list(cluster.run_unordered(divmod, ((n, 7) for n in range(20_000))))
-    assert sorted(results) == sorted(divmod(n, 7) for n in range(20_000))
-
-
-def test_an_error_of_a_task_arrives_as_it_is(threads):
-    with Cluster(threads) as cluster:
-        with pytest.raises(ZeroDivisionError):
-            list(cluster.run_unordered(divmod, [(1, 1), (1, 0)]))
-        with pytest.raises(FileNotFoundError, match="no-such-file"):
-            list(cluster.run_unordered(os.stat, [("no-such-file",)]))
-
-
-def test_tasks_are_taken_as_workers_come_free(threads):
-    taken = 0
-
-    def tasks() -> Iterator[tuple[float]]:
-        nonlocal taken
-        while taken < 100_000:
-            taken += 1
-            yield (0.5,)
-
-    with Cluster(threads) as cluster:
-        results = cluster.run_unordered(time.sleep, tasks())
-        next(results)
-        results.close()
-        assert taken < 100

@@ -1,4 +1,4 @@
-"""Tasks on processes of this machine, and the batches that a pool of workers is given."""
+"""Tasks on processes of this machine and on a cluster, and the batches that a pool is given."""
 
 import os
 import time
@@ -8,19 +8,29 @@ from concurrent.futures import Future
 from typing import Any
 
 import pytest
+from support.dask_processes import threads_for_workers
 
 from slatprep.errors import SlatprepError
-from slatprep.workers.local import Pool, run_in_pools, run_unordered, single_threaded
+from slatprep.workers.dask import Cluster
+from slatprep.workers.local import Jobs, Pool, run_in_pools, run_unordered, single_threaded
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.fixture(scope="module", params=[1, 2, "cluster"])
+def jobs(request: pytest.FixtureRequest) -> Iterator[Jobs]:
+    """This process, two of this machine, and a cluster."""
+    if request.param != "cluster":
+        yield request.param
+        return
+    with threads_for_workers(2) as started, Cluster(started.scheduler_address) as cluster:
+        yield cluster
+
+
 def test_every_task_is_done_once(jobs):
-    results = run_unordered(divmod, ((n, 7) for n in range(100)), jobs)
-    assert sorted(results) == sorted(divmod(n, 7) for n in range(100))
+    results = run_unordered(divmod, ((n, 7) for n in range(5000)), jobs)
+    assert sorted(results) == sorted(divmod(n, 7) for n in range(5000))
 
 
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.parametrize("jobs", [1, 2])
 def test_tasks_are_taken_as_workers_come_free(jobs):
     taken = 0
 
@@ -38,10 +48,11 @@ def test_tasks_are_taken_as_workers_come_free(jobs):
         results.close()
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_of_a_task_arrives(jobs):
     with pytest.raises(ZeroDivisionError):
         list(run_unordered(divmod, [(1, 1), (1, 0)], jobs))
+    with pytest.raises(FileNotFoundError, match="no-such-file"):
+        list(run_unordered(os.stat, [("no-such-file",)], jobs))
 
 
 def test_a_killed_worker_is_an_error_in_words():
