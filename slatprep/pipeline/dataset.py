@@ -1,7 +1,8 @@
 """Build a store: every asset of a dataset, brought to one scale and packed.
 
 `slatprep.pipeline.asset` processes one asset; `build_store` runs it over a
-dataset, for what is new or changed, and replaces the store in one step.
+dataset, for what is new or changed, and replaces the store in one step. Its
+steps are: discover, look back, plan, finish, settle, pack, publish.
 """
 
 from __future__ import annotations
