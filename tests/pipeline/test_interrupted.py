@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 from support.build_process import Build, kill_at
+from support.faults import inject
 from support.rights import BOUND_BY_PERMISSIONS
-from support.synthetic import Dataset, Made, make_asset
+from support.synthetic import Dataset, Made
 from support.trees import tree
 
 from slatprep.errors import StoreError
@@ -168,19 +169,15 @@ if step == {step!r}:
     ends_well(dataset, out, expected)
 
 
-def test_a_source_that_vanishes_midway(reference, tmp_path):
+def test_a_source_that_vanishes_midway(reference, tmp_path, monkeypatch):
     dataset, expected = reference
-    slat = str(dataset.root / "slat" / "b.npz")
-    fault = f"""
-if (step, name) == ("asset begun", "b"):
-    os.unlink({slat!r})
-"""
-    done = Build(dataset, tmp_path / "s.zarr", fault).done()
-    statuses, problems = json.loads(done.stdout)
-    assert statuses == {"ok": 2, "failed": 1, "skipped": 0}
-    assert "b.npz: does not exist" in problems["b"]
-    made = make_asset(1)
-    dataset.write_slat("b.npz", made.coords, dataset.assets["b"].feats)
+    slat, kept = dataset.root / "slat" / "b.npz", tmp_path / "b.npz"
+    with monkeypatch.context() as context:
+        inject(context, lambda *at: at == ("asset begun", "b") and slat.rename(kept))
+        summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr")
+    assert summary.statuses == {"ok": 2, "failed": 1, "skipped": 0}
+    assert "b.npz: does not exist" in dict(summary.problems)["b"]
+    kept.rename(slat)
     ends_well(dataset, tmp_path / "s.zarr", expected)
 
 
