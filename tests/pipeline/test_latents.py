@@ -139,9 +139,7 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
         ("latents", {"encoder": "x", "channels": 9, "resolution": 64}, "9 columns of voxel/feats"),
         ("latents", {"encoder": "x", "channels": 8, "resolution": 64, "mean": [0.0]}, "8 channels"),
         ("latents", {"encoder": "x", "channels": 0, "resolution": 64}, "latents/channels"),
-        ("property_columns", ["density"], "must name the same properties"),
         ("property_columns", ["E [Pa]", "density", "poissons_ratio"], "property_columns/0"),
-        ("property_units", ["Pa"], "a unit for each"),
     ],
 )
 def test_attributes_that_do_not_fit_the_arrays_are_refused(copy, attribute, value, said):
