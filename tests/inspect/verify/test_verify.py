@@ -65,15 +65,18 @@ SHARDS = [
 ]
 
 
-@pytest.mark.parametrize(("byte", "what"), [(20, "chunk 0 is damaged"), (-6, "no sound index")])
-def test_flipped_bits_name_the_files_and_the_assets(store, byte, what):
-    for name in SHARDS:
-        flip(store / name, byte, 3)
-    findings = found(store)
-    for name in SHARDS:
-        assert any("its bytes changed" in one.what for one in of_file(findings, name)), name
-    named = {finding.asset: finding.file for finding in findings if what in finding.what}
-    assert named.keys() - {""} and set(named.values()) <= set(SHARDS)
+@pytest.mark.parametrize(
+    ("name", "byte", "what"),
+    [
+        *((name, 20, "chunk 0 is damaged") for name in SHARDS),
+        *((name, -6, "no sound index") for name in SHARDS[::3]),
+    ],
+)
+def test_a_flipped_bit_names_the_file_and_the_assets(store, name, byte, what):
+    flip(store / name, byte, 3)
+    findings = of_file(found(store), name)
+    assert any("its bytes changed" in finding.what for finding in findings)
+    assert any(finding.asset and what in finding.what for finding in findings)
 
 
 def test_truncated_shards_are_found(store):
