@@ -80,9 +80,11 @@ def test_refused_in_words_and_nothing_changes(folder, line):
     assert tree(folder) == before
 
 
-def test_a_link_into_a_store_is_no_way_in(folder):
+def test_neither_a_link_into_a_store_nor_a_device_is_replaced(folder):
     (folder / "link").symlink_to(folder / "s.zarr" / "zarr.json")
     assert "lies inside the store" in run("report @s.zarr --out @link", folder).stderr
+    assert "is a pipe or device" in run("report @s.zarr --out /dev/null", folder).stderr
+    assert Path("/dev/null").is_char_device()
 
 
 def test_sources_of_a_dataset_definition_are_not_overwritten(folder):
@@ -98,21 +100,17 @@ def test_sources_of_a_dataset_definition_are_not_overwritten(folder):
         run("align --config @d.toml --out @new.jsonl", folder, code=0)
 
 
-def test_a_device_is_not_replaced(folder):
-    assert "is a pipe or device" in run("report @s.zarr --out /dev/null", folder).stderr
-    assert Path("/dev/null").is_char_device()
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "align --pixieverse @sources/pixieverse --slat @sources/slat --out @sources/slat/r.jsonl",
-        "evaluate @predictions --store @s.zarr --split all --csv @predictions/scores.csv",
-    ],
-)
-def test_a_new_file_below_what_is_read_is_written(folder, line):
+def test_new_files_below_what_is_read_and_beside_a_store_are_written(folder):
+    sources = "--pixieverse @sources/pixieverse --slat @sources/slat"
+    evaluate = "evaluate @predictions --store @s.zarr --split all"
     before = tree(folder)
-    assert "expected another path" not in run(line, folder).stderr
+    for line in (f"align {sources} --out @sources/slat/r.jsonl",
+                 f"{evaluate} --csv @predictions/scores.csv"):  # fmt: skip
+        assert "expected another path" not in run(line, folder).stderr
+    for _ in range(2):
+        run("describe @s.zarr --out @s.json", folder, code=0)
+        run("stats @s.zarr --csv @sources/s.csv", folder, code=0)
+        run("export @s.zarr --format npz --out @sources/npz", folder, code=0)
     assert before.items() <= tree(folder).items()
 
 
@@ -121,10 +119,3 @@ def test_predictions_lie_below_the_run_that_made_them(folder):
     for out, refused in (("run/x", False), ("run/new", False), ("run", True)):
         words = run(f"predict @sources/slat --checkpoint @run --out @{out}", folder).stderr
         assert ("expected another path" in words) is refused, words
-
-
-def test_results_beside_a_store_and_beside_sources_are_written(folder):
-    for _ in range(2):
-        run("describe @s.zarr --out @s.json", folder, code=0)
-        run("stats @s.zarr --csv @sources/s.csv", folder, code=0)
-        run("export @s.zarr --format npz --out @sources/npz", folder, code=0)
