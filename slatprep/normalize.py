@@ -35,8 +35,9 @@ _HALF_WIDTH_OF_A_POINT = 0.5
 def to_mapped(properties: ArrayLike, table: _Table = PROPERTIES) -> NDArray[np.float64]:
     """Map SI properties (N, P) to their log10 where the table says so; the others stay."""
     mapped = np.array(properties, dtype=np.float64)
-    columns = [column for column, one in enumerate(table) if one.log10]
-    mapped[..., columns] = np.log10(mapped[..., columns])
+    for column, one in enumerate(table):
+        if one.log10:
+            np.log10(mapped[..., column], out=mapped[..., column])
     return mapped
 
 

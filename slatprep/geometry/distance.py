@@ -52,35 +52,22 @@ def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 @kernel()
 def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
-    """Squared distance within each line to the nearest voxel of the other kind; 0 in that kind."""
+    """Squared distance within each line to the nearest voxel of the other kind, into zeros."""
     length = solid.shape[2]
-    apart = np.empty(length, np.int16)
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):
-            line, ahead = solid[i, j], solid[i, j, 1:]
-            into, out = inside[i, j, :length], outside[i, j, :length]
-            changes = 0
-            for k in range(len(ahead)):
-                changes += line[k] != ahead[k]
-            if changes == 0:  # as of most lines
-                within, beyond = (NOTHING * NOTHING, 0) if line[0] else (0, NOTHING * NOTHING)
+            line, begin = solid[i, j], 0
+            for end in range(1, length + 1):
+                if end < length and line[end] == line[end - 1]:
+                    continue
+                # From `begin` to `end` all are of a kind; the next of the other one lie there.
+                before = begin - 1 if begin > 0 else -NOTHING
+                after = end if end < length else length + NOTHING
+                into = inside[i, j, begin:end] if line[begin] else outside[i, j, begin:end]
                 for k in range(len(into)):
-                    into[k] = within
-                for k in range(len(out)):
-                    out[k] = beyond
-                continue
-            steps = NOTHING
-            for k in range(length):
-                steps = 1 if k and line[k] != line[k - 1] else min(steps + 1, NOTHING)
-                apart[k] = steps
-            steps = NOTHING
-            for k in range(length - 1, -1, -1):
-                changed = k + 1 < length and line[k] != line[k + 1]
-                steps = 1 if changed else min(steps + 1, NOTHING)
-                apart[k] = min(apart[k], steps)
-            for k in range(length):
-                square = apart[k] * apart[k]
-                into[k], out[k] = (square, 0) if line[k] else (0, square)
+                    apart = np.int16(min(begin + k - before, after - begin - k, NOTHING))
+                    into[k] = apart * apart
+                begin = end
 
 
 @kernel()

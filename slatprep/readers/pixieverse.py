@@ -207,12 +207,14 @@ def _classes_of(
 
 def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
     ids = np.ascontiguousarray(ids)  # Every fourth value of a raw grid, looked at several times.
-    known = (ids >= UNLABELLED) & (ids <= BACKGROUND) & (ids == np.rint(ids))
+    with np.errstate(invalid="ignore"):  # what is no int8 becomes another number
+        classes = ids.astype(np.int8)
+    known = (classes == ids) & (classes >= UNLABELLED) & (classes <= BACKGROUND)
     if not known.all():
         voxel = _first(~known)
         expected = f"whole class ids from {UNLABELLED} to {BACKGROUND}"
         raise InputError(path, f"unknown class {ids[voxel]:g} at voxel {voxel}", expected)
-    return ids.astype(np.int8)
+    return classes
 
 
 def _classes_of_scores(
