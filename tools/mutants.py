@@ -56,7 +56,7 @@ TESTS = {
     "judge/evidence": ["judge/test_evidence.py"],
     "judge/confidence": ["judge/test_evidence.py", "judge/test_verdict.py"],
     "judge/verdict": ["judge/test_verdict.py", "align/test_quality.py"],
-    "judge/witness": ["judge/test_witness_sums.py", "judge/test_witness.py"],
+    "judge/witness": ["judge/test_witness.py", "judge/test_witness.py"],
     "normalize": ["test_normalize.py"],
     "geometry/frames": ["geometry"],
     "geometry/voxels": ["geometry/test_frames.py"],

@@ -18,8 +18,9 @@ from slatprep.cli.commands import slatprep
 from slatprep.pipeline.dataset import build_store
 
 BEFORE = (
-    "work folder made", "asset aligned", "store created", "shard filled", "records written",
-    "directory flushed",
+    "work folder made", "work folder locked", "asset compared", "asset begun", "asset read",
+    "asset aligned", "asset spooled", "store created", "shard begun", "shard filled",
+    "shard written", "records written", "directory flushed",
 )  # fmt: skip
 AFTER = ("directory exchanged", "store replaced", "manifests written", "manifests published")
 
@@ -51,7 +52,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     ("step", "number"),
     [
         *((step, signal.SIGTERM) for step in (*BEFORE, *AFTER)),
-        ("asset aligned", signal.SIGINT),
+        ("asset begun", signal.SIGINT),
         ("store replaced", signal.SIGINT),
     ],
 )
