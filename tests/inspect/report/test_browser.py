@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +16,13 @@ import numpy as np
 import pytest
 import zarr
 from PIL import Image
-from support.pages import HOSTILE, Report
+from support.pages import HOSTILE, Page, Report
+from support.synthetic import Dataset, MakeDataset
 
 from slatprep.inspect.report import write_report
+from slatprep.inspect.verify import verify_store
+from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
+from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
 
 if TYPE_CHECKING:
@@ -43,10 +49,53 @@ def open_page(browser: Chrome, report: Report, end: str = "") -> None:
     wait(lambda: browser.execute_script(ready))
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
+    """Start a headless Chromium; without one the tests are skipped, but never in CI."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+    chromedriver = shutil.which("chromedriver")
+    if chromium is None or chromedriver is None:
+        text = "no chromium and chromedriver here; apt-get install chromium chromium-driver"
+        if os.environ.get("SLATPREP_NEEDS_BROWSER"):
+            pytest.fail(text)
+        pytest.skip(text)
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in (
+        "--headless=new",
+        "--no-sandbox",  # which root has to do without
+        "--disable-dev-shm-usage",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--no-first-run",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--force-prefers-reduced-motion",
+        "--window-size=1400,1000",
+        f"--user-data-dir={tmp_path_factory.mktemp('chromium')}",
+    ):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(chromedriver))
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
 @pytest.fixture
 def opened(browser: Chrome, hostile: Report) -> Chrome:
     open_page(browser, hostile)
     return browser
+
+
+def page_of(made: BuildSummary, path: Path) -> Report:
+    """Write the page of a build."""
+    store, manifests = Path(str(made.store)), made.records.parent
+    write_report(open_store(store), path, manifests=manifests)
+    return Report(store, manifests, path)
 
 
 def rows(browser: Chrome) -> list[str]:
@@ -85,6 +134,7 @@ def test_it_opens_sorts_and_filters(opened):
     assert set(rows(opened)) == everything
     click(opened, "[data-sort=id]")
     assert rows(opened) == sorted(everything)
+    assert opened.find_elements("css selector", "[data-sort=votes]") == []  # No labels are merged.
     click(opened, "[data-sort=id]")
     assert rows(opened) == sorted(everything, reverse=True)
     click(opened, "[data-sort=voxels]")  # Those not in the store have none, and come last.
@@ -190,10 +240,7 @@ def test_an_asset_without_a_picture_says_why_it_is_not_there(opened):
 def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
     browser, deformed_build, tmp_path
 ):
-    path = tmp_path / "page.html"
-    records = deformed_build.records.parent
-    write_report(open_store(deformed_build.store), path, manifests=records)
-    open_page(browser, Report(Path(deformed_build.store), records, path))
+    open_page(browser, page_of(deformed_build, tmp_path / "page.html"))
     assert set(rows(browser)) == {"bent", "long"}
     click(browser, "[data-sort=model]")
     assert rows(browser) == ["long", "bent"]
@@ -284,3 +331,128 @@ def test_a_phone_shows_whole_headings_and_numbers(browser, hostile):
         assert browser.execute_script(page) == 0
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+# -- merged labels -----------------------------------------------------------
+
+
+FACTORS = {"a": (1.0, 2.0), "b": (1.0, 1.1, 1.0)}
+"""What the samples of the objects make of Young's modulus."""
+
+
+@pytest.fixture
+def merged(make_dataset: MakeDataset, tmp_path: Path) -> BuildSummary:
+    dataset = make_dataset("a", "b", "c")
+    for name, factors in FACTORS.items():
+        for sample, factor in enumerate(factors):
+            grid = dataset.assets[name].grid.copy()
+            grid[grid[..., 3] != 7, 1] *= factor
+            path = dataset.root / "pixieverse" / name / f"sample_{sample}" / "material_grid.npy"
+            path.parent.mkdir(exist_ok=True)
+            np.save(path, grid)
+    (dataset.root / "pixieverse/b/sample_2/material_grid.npy").write_bytes(b"torn")
+    parameters = dataset.parameters()
+    source = replace(parameters.pixieverse, samples="merge")
+    return build_store(replace(parameters, pixieverse=source), tmp_path / "s.zarr")
+
+
+def test_assets_say_how_many_annotations_agree(merged, browser, tmp_path):
+    report = page_of(merged, tmp_path / "page.html")
+    assets = Page(report.path).content["assets"]
+    assert assets["annotations"] == [[2, 2], [2, 3], None]
+    assert assets["votes"] == [1.0, 1.0, None]
+    modulus = open_store(report.store).normalization.ranges[0]
+    expected = [
+        np.std(np.log10(FACTORS[name][:2])) * 2 / (modulus.hi - modulus.lo) for name in "ab"
+    ]
+    np.testing.assert_allclose([one[0] for one in assets["spreads"][:2]], expected, atol=1e-4)
+    assert assets["spreads"][2] is None
+
+    open_page(browser, report, "#asset=a")
+    assert "assets with merged labels\n2" in browser.find_element("id", "tiles").text
+    text = browser.find_element("id", "asset-figures").text.split("\n")
+    figures = dict(zip(text[::2], text[1::2], strict=False))
+    assert figures["Annotations merged"] == "2"
+    assert figures["Votes for the class"] == "100.0 %"
+    assert figures["Young's modulus, spread"] == "factor 1.41"  # 10 to the std of log10 1 and 2
+    assert figures["Poisson's ratio, spread"] == "± 0"
+    order = []
+    for _ in range(2):
+        click(browser, "[data-sort=spread]")
+        order.append(rows(browser))
+    assert order == [["b", "a", "c"], ["a", "b", "c"]]
+    assert browser.get_log("browser") == []
+
+
+# -- a store of hostile texts that `verify` accepts ----------------------------
+
+
+IN_NAMES = '<img src=x onerror="window.broken = 1"><svg onload=alert(1)>'
+"""What a name of a file can hold: no slash."""
+
+SOUND = ("ant", "__proto__", "constructor")
+REFUSED = (f"a{IN_NAMES}", "javascript:window.broken = 1", "${window.broken = 1}", '`"><b>')
+"""Ids: only those of plain letters go into a store, and a page lists the others."""
+
+EVERYTHING = """
+const pressed = (selector) => [...document.querySelectorAll(selector)].map((one) => one.click());
+pressed("[data-sort], [data-state], [data-key] .bin, .chip, [data-mode], [data-switch], summary");
+for (const choice of document.querySelectorAll("select"))
+  for (const option of choice.options) {
+    choice.value = option.value;
+    choice.dispatchEvent(new Event("change"));
+  }
+for (const one of document.querySelectorAll("*"))
+  for (const kind of ["mouseover", "mouseenter", "pointermove", "focus"])
+    one.dispatchEvent(new Event(kind, {bubbles: true}));
+"""
+"""Presses, chooses and points at all that there is."""
+
+
+@pytest.fixture(scope="module")
+def strange(tmp_path_factory: pytest.TempPathFactory) -> Report:
+    """Build such a store from its sources, and write its page."""
+    root = tmp_path_factory.mktemp("texts") / IN_NAMES
+    dataset = Dataset(root)
+    (root / "voxels").mkdir(parents=True)
+    units = {"density": HOSTILE, "friction": f"{HOSTILE}\u2028\n", "heat": "\\u003cscript>"}
+    for number, name in enumerate((*SOUND, *REFUSED, "torn")):
+        dataset.add(name, number)
+        asset = dataset.assets[name]
+        voxels = np.argwhere(asset.grid[..., 3] != 7)
+        columns = {unit: asset.grid[tuple(voxels.T)][:, 0].astype(np.float64) for unit in units}
+        np.savez(root / "voxels" / f"{name}.npz", voxels=voxels, **columns)
+    (root / "voxels" / "torn.npz").write_bytes(b"PK torn")
+    np.savez(root / "slat" / f"lone{IN_NAMES}.npz", coords=np.zeros((1, 3)))
+    np.savez(root / "voxels/strange.npz", **{IN_NAMES: np.zeros(1)})
+    dataset.write_slat("strange.npz", dataset.assets["ant"].coords, dataset.assets["ant"].feats)
+    described = [{"name": name, "unit": unit, "scale": "log10"} for name, unit in units.items()]
+    (root / "voxels/source.json").write_text(
+        json.dumps({"properties": described, "classes": False})
+    )
+    kinds = (HOSTILE, "__proto__", f"{HOSTILE}\u2028`${{window.broken = 1}}")
+    categories = {name: {"obj_class": kind} for name, kind in zip(SOUND, kinds, strict=True)}
+    (root / "categories.json").write_text(json.dumps(categories))
+    parameters = BuildParameters(
+        PixieverseSource(root / "voxels", adapter="voxels"),
+        SlatSource(root / "slat"),
+        pairing=PairingParameters(categories=root / "categories.json"),
+        name=HOSTILE,
+    )
+    summary = build_store(parameters, root / f"{IN_NAMES}.zarr")
+    assert summary.statuses["ok"] == len(SOUND)
+    assert verify_store(root / f"{IN_NAMES}.zarr", sources=True).findings == ()
+    return page_of(summary, root / f"{IN_NAMES}.html")
+
+
+def test_no_text_of_a_store_that_verify_accepts_runs(browser, strange):
+    for end in ("", "#asset=0", f"#asset={IN_NAMES}", f"#{HOSTILE}", "#asset=${window.broken=1}"):
+        open_page(browser, strange, end)
+        shown = browser.execute_script("return document.body.textContent")
+        assert [text for text in (*SOUND, *REFUSED, IN_NAMES, HOSTILE) if text not in shown] == []
+        browser.execute_script(EVERYTHING)
+        for _ in range(len(SOUND) + 2):
+            click(browser, "#next")
+        odd = "return document.querySelectorAll('body script[src], svg[onload], b').length"
+        assert browser.execute_script(odd) == 0
+        assert_quiet(browser)

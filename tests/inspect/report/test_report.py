@@ -59,6 +59,7 @@ def test_every_asset_is_listed_with_its_state_and_why(page):
     assert assets["reasons"][1] == []
     assert "SLAT" in assets["reasons"][5][0]
     assert assets["picture"] == [0, 1, 2, 3, 4, None, None]
+    assert assets["annotations"] == [None] * 7
     assert {len(column) for column in assets.values()} == {7}
 
 
