@@ -18,7 +18,7 @@ from slatprep.readers.contents import contents_of
 from slatprep.readers.joins import by_case, read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.published import category_of, hint_of, locate_grids
-from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered
+from slatprep.readers.slat_files import NamedSlat, encoded, find_slats, ordered, slat_patterns
 from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.archives import is_archive
 from slatprep.storage.files import Listing
@@ -123,8 +123,7 @@ def _grids_of(
     grids = adapters.find_grids(source, listing)
     if grids:
         return grids
-    patterns = adapters.patterns_of(adapters.source_adapter(source.adapter), source)
-    tried = tried_names(patterns, {"sample": source.sample})
+    tried = _tried_grids(source, {})
     # Plain voxels have the names that SLATs have.
     ours = source.adapter == PixieverseSource.adapter and slat.root.is_dir()
     other = replace(source, root=slat.root)
@@ -250,8 +249,7 @@ def _pair_of(
                     tried = fill(source.transform, known)
                     problems.append(f"no transform for id {row.object_id!r}; looked for {tried}")
     else:
-        tried = tried_names(source.grid, {"id": "{id}", "sample": source.sample})
-        problems += _lacking(row, there, "grid", tried)
+        problems += _lacking(row, there, "grid", _tried_grids(source, {"id": "{id}"}))
     found = [slat for slat in row.slats if slat.path]
     if not found and not any(grid.problem for grid in grids):
         problems += _lacking(row, there, "SLAT", _tried_slats(row, there))
@@ -306,12 +304,17 @@ def _unrecordable(path: str) -> str:
     return f"{path}: its name is no UTF-8, so that no record can hold it; rename it"
 
 
+def _tried_grids(source: PixieverseSource, known: Mapping[str, str]) -> str:
+    patterns = adapters.patterns_of(adapters.source_adapter(source.adapter), source)
+    return tried_names(patterns, {**known, "sample": source.sample})
+
+
 def _tried_slats(row: _Row, there: _Found) -> str:
     names = sorted({slat.slat_id for slat in row.slats} - {row.object_id}) or ["{id}"]
     if there.roots.slat != there.slat.root:
         groups = " or ".join(f"group {fill(there.slat.group, {'id': name})}" for name in names)
         return f"{groups} in {there.slat.root}"
-    return "; ".join(tried_names(there.slat.pattern, {"id": name}) for name in names)
+    return "; ".join(tried_names(slat_patterns(there.slat), {"id": name}) for name in names)
 
 
 def _find_one(

@@ -99,7 +99,7 @@ def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]
     for slat in _each_slat(source, one_file):
         slats.setdefault(slat.slat_id, []).append(slat)
     if not slats:
-        tried = f"groups {source.group}" if one_file else tried_names(_patterns_of(source), {})
+        tried = f"groups {source.group}" if one_file else tried_names(slat_patterns(source), {})
         hint = "" if one_file else _hint(source)
         raise ConfigError(f"{source.root}: no SLAT found; looked for {tried}{hint}")
     problems = [slat.problem for found in slats.values() for slat in found if slat.problem]
@@ -123,7 +123,7 @@ def _hint(source: SlatSource) -> str:
     return f"; {held_names(files, folders)}"
 
 
-def _patterns_of(source: SlatSource) -> tuple[str, ...]:
+def slat_patterns(source: SlatSource) -> tuple[str, ...]:
     """Return the patterns of the dataset definition, or the encoder's own where it has none."""
     own = getattr(latent_adapter(source.encoder), "patterns", ())
     return own if own and source.pattern == SlatSource.pattern else source.pattern
@@ -135,7 +135,7 @@ def _each_slat(source: SlatSource, one_file: bool) -> Iterator[NamedSlat]:
         return
     listing = list_below(source.root)
     unlisted: set[str] = set()
-    for pattern in _patterns_of(source):
+    for pattern in slat_patterns(source):
         for fields, path, problem in find_files(listing, pattern, {}):
             if path in unlisted:
                 continue

@@ -121,6 +121,22 @@ def test_missing_partners_are_yielded_with_what_was_looked_for(find, tmp_path):
             assert str(caught.value).count(f"'{pair.asset_id}'") == 1
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_what_an_adapter_looked_for_is_told_unless_the_definition_says_otherwise(find, own):
+    grids = ["a.npz" if own else "voxels/a_with_materials.npz"]
+    slats = ["b.npz" if own else "shape_latents/dino_512/b.npz"]
+    vomp: dict[str, object] = {"adapter": "vomp"}
+    latents: dict[str, object] = {"encoder": "trellis2-512"}
+    if own:
+        vomp["grid"] = latents["pattern"] = ("{id}.npz",)
+    no_slat, no_grid = find(grids, slats, pixieverse=vomp, slat=latents)
+    told = "{id}.npz" if own else "voxels/{id}_with_materials.npz, {id}_with_materials.npz"
+    assert no_grid.problem == f"no grid for id 'b'; looked for {told}"
+    told = "for {id}.npz" if own else "latents/*/{id}.npz, shape_latents/*_512/{id}.npz"
+    assert no_slat.problem.startswith("no SLAT for id 'a'; looked for {id}.npz")
+    assert no_slat.problem.endswith(told)
+
+
 @pytest.mark.parametrize("files", [("a.npz", "a.h5"), ("a/v.npz", "a/v.h5")])
 def test_two_slats_for_one_id(find, files):
     (pair,) = find([grid("a")], files)
