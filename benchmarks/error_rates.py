@@ -20,7 +20,7 @@ import numpy as np
 from calibrate import Table, read_tables
 from numpy.typing import NDArray
 
-from slatprep.judge.confidence import right_placements, same_objects
+from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT
 from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
 from slatprep.judge.verdict import THRESHOLDS
 
@@ -64,7 +64,7 @@ def _draw(table: Table, share: float, most: int, seed: int) -> dict[str, float]:
 
 def _good(figures: NDArray[np.float64]) -> NDArray[np.bool_]:
     good: NDArray[np.bool_] = (
-        same_objects(figures) * right_placements(figures) >= THRESHOLDS.good_confidence
+        SAME_OBJECT.probability(figures) * PLACEMENT.probability(figures) >= THRESHOLDS.good_confidence
     )
     return good
 
@@ -75,8 +75,8 @@ def _told(found: ErrorRates, good: NDArray[np.bool_], wrong: NDArray[np.bool_]) 
     least, most = found.good_wrong_range
     truly = int((good & wrong).sum())
     return {
-        "targets": found.targets,
-        "decoys": found.decoys,
+        "targets": len(found.scores),
+        "decoys": len(found.decoy_scores),
         "stated": found.wrong_share,
         "holds": low <= wrong.mean() <= high,
         "good wrong": truly,

@@ -6,40 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
 
-from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
+from slatprep.judge.calibration import SAME_OBJECT, VOXEL
 from slatprep.judge.evidence import FIGURES, Surroundings
 from slatprep.judge.model import FLOOR
 
-_CAUSES = {
-    "shape": ("moved", "moved_most", "bending", "stretch", "scale", "within_2", "within_3",
-              "score_similarity", "ground", "directions_worst", "blocks_far"),
-    "roughness": ("score_slat", "score_pixieverse", "within_1", "offset", "distance", "depth",
-                  "fitness", "fitness_backward", "valid_share", "directions_near",
-                  "directions_middle", "blocks_near", "blocks_middle", "slat_within_half",
-                  "slat_within_1", "slat_within_15", "pixieverse_within_half",
-                  "pixieverse_within_1", "pixieverse_within_15"),
-}  # fmt: skip
-"""Which figures speak for another object by its shape, and which by a rough fit."""
-
-
-def same_object(evidence: NDArray[np.float64]) -> float:
-    """Return the probability that both sides show the same object, by the `FIGURES` (F,)."""
-    return float(SAME_OBJECT.probability(evidence))
-
-
-def right_placement(evidence: NDArray[np.float64]) -> float:
-    """Return the probability that the placement is right if the object is the same."""
-    return float(PLACEMENT.probability(evidence))
-
-
-def same_objects(evidence: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what `same_object` says of many alignments (A, F)."""
-    return SAME_OBJECT.probability(evidence)
-
-
-def right_placements(evidence: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what `right_placement` says of many alignments (A, F)."""
-    return PLACEMENT.probability(evidence)
+_OF_SHAPE = {"moved", "moved_most", "bending", "stretch", "scale", "within_2", "within_3",
+             "score_similarity", "ground", "directions_worst", "blocks_far"}  # fmt: skip
+"""Which figures speak for another object by its shape; the others do by a rough fit."""
 
 
 def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
@@ -48,11 +21,9 @@ def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
     For ``shape`` and ``roughness`` the sum of what their figures take from the
     logarithm of the odds; largest first.
     """
-    added = dict(zip(FIGURES, SAME_OBJECT.contributions(evidence), strict=True))
-    taken = {
-        cause: float(-sum(min(added.get(name, 0.0), 0.0) for name in names))
-        for cause, names in _CAUSES.items()
-    }
+    taken = {"shape": 0.0, "roughness": 0.0}
+    for name, added in zip(FIGURES, SAME_OBJECT.contributions(evidence).tolist(), strict=True):
+        taken["shape" if name in _OF_SHAPE else "roughness"] -= min(added, 0.0)
     return dict(sorted(taken.items(), key=lambda item: -item[1]))
 
 
@@ -84,7 +55,7 @@ def class_confidence(
 ) -> NDArray[np.float32]:
     """Return how likely the class of each voxel (N,) is right, 0 where not valid.
 
-    `confidence` is the asset's: `same_object` times `right_placement`. Placements that fit equally
+    `confidence` is the asset's: that of its object times that of its placement. Placements that fit equally
     well are taken as equally likely: the model's probability counts for those with the same class.
     """
     likely = np.zeros(len(valid), dtype=np.float32)

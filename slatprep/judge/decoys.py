@@ -20,7 +20,6 @@ from scipy.optimize import isotonic_regression, minimize
 from scipy.special import expit, logit
 
 from slatprep.judge.calibration import SAME_OBJECT
-from slatprep.judge.confidence import same_objects
 from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 
@@ -55,8 +54,6 @@ class ErrorRates:
 
     Attributes
     ----------
-    targets, decoys : int
-        Alignments of the dataset, and of decoys.
     refitted : bool
         Whether the score was learned on them; else the shipped model's stands.
     wrong_share : float
@@ -77,8 +74,6 @@ class ErrorRates:
         Least share of wrong ones among all targets up to a score that includes this one.
     """
 
-    targets: int
-    decoys: int
     refitted: bool
     wrong_share: float
     wrong_share_range: Range
@@ -116,7 +111,7 @@ def error_rates(
     draws of `seed`.
     """
     refitted = len(targets) >= LEAST_TARGETS and len(decoys) >= LEAST_DECOYS
-    scores, decoy_scores = (logit(same_objects(values)) for values in (targets, decoys))
+    scores, decoy_scores = (logit(SAME_OBJECT.probability(values)) for values in (targets, decoys))
     if refitted:
         scores, decoy_scores = _refitted(targets, decoys, target_folds, decoy_folds)
     rng = np.random.default_rng(seed)
@@ -127,8 +122,6 @@ def error_rates(
     most = int(good.sum())
     wrong = np.minimum(count * shares * passing, most)
     return ErrorRates(
-        targets=count,
-        decoys=len(decoys),
         refitted=refitted,
         wrong_share=share,
         wrong_share_range=(min(low, share) if share else 0.0, high),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -259,16 +259,6 @@ def evidence_of(
     )
 
 
-def _agreement(agreement: Agreement | None) -> tuple[float, ...]:
-    if agreement is None:
-        return (math.nan,) * (6 + 3 + 3)
-    return (
-        agreement.directions_near,
-        agreement.directions_middle,
-        agreement.directions_worst,
-        agreement.blocks_near,
-        agreement.blocks_middle,
-        agreement.blocks_far,
-        *agreement.within_slat,
-        *agreement.within_pixieverse,
-    )
+def _agreement(agreement: Agreement | None) -> NDArray[np.float64]:
+    figures = FIGURES[FIGURES.index("directions_near") :]
+    return np.full(len(figures), np.nan) if agreement is None else np.hstack(astuple(agreement))

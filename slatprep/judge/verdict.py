@@ -99,18 +99,14 @@ def judge(
     likely : ndarray of float32, shape (N,)
         How likely the class of each SLAT voxel is right, as `voxel_confidence` says.
     """
-    from slatprep.judge.confidence import (
-        causes_of_doubt,
-        class_confidence,
-        right_placement,
-        same_object,
-    )
+    from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT
+    from slatprep.judge.confidence import causes_of_doubt, class_confidence
     from slatprep.judge.evidence import evidence_of, surroundings_of
 
     ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters)
     around = surroundings_of(field, latents, alignment, annotation)
     evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
-    same, placed = same_object(evidence), right_placement(evidence)
+    same, placed = (float(one.probability(evidence)) for one in (SAME_OBJECT, PLACEMENT))
     by = alignment.settled_by
     if by is not None and ambiguity.material_share > THRESHOLDS.good_ambiguity:
         # One of those that tie is right as likely as without a tie, and this is that one.

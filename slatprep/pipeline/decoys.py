@@ -48,6 +48,10 @@ FILE = "decoys.json"
 LEAST_TOLD = 0.001
 """Least probability of an error that is kept for an asset."""
 
+_TAKEN_OVER = ("refitted", "wrong_share", "wrong_share_range", "good", "good_wrong",
+               "good_wrong_range")  # fmt: skip
+"""What is kept as `slatprep.judge.decoys.ErrorRates` has it."""
+
 BINS = 40
 _MAX_BYTES = 64 * 2**20
 
@@ -236,13 +240,8 @@ def measure_errors(
     result = MeasuredErrors(
         build=store.about.manifest,
         seed=seed,
-        assets=rates.targets,
-        refitted=rates.refitted,
-        wrong_share=rates.wrong_share,
-        wrong_share_range=rates.wrong_share_range,
-        good=rates.good,
-        good_wrong=rates.good_wrong,
-        good_wrong_range=rates.good_wrong_range,
+        assets=len(store),
+        **{name: getattr(rates, name) for name in _TAKEN_OVER},
         kept=tuple(Kept(rate, *rates.kept(rate)) for rate in RATES),
         errors={one: round(error, 6) for one, error in sorted(errors) if error >= LEAST_TOLD},
         edges=tuple(edges.tolist()),
