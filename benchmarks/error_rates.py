@@ -63,9 +63,8 @@ def _draw(table: Table, share: float, most: int, seed: int) -> dict[str, float]:
 
 
 def _good(figures: NDArray[np.float64]) -> NDArray[np.bool_]:
-    good: NDArray[np.bool_] = (
-        SAME_OBJECT.probability(figures) * PLACEMENT.probability(figures) >= THRESHOLDS.good_confidence
-    )
+    likely = SAME_OBJECT.probability(figures) * PLACEMENT.probability(figures)
+    good: NDArray[np.bool_] = likely >= THRESHOLDS.good_confidence
     return good
 
 

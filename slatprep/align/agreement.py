@@ -39,10 +39,6 @@ def agreement_of(slat: Array, pixieverse: Array, normals: Array, places: Array) 
     near, middle, counts = _by_direction(apart, normals)
     median, samples = _by_block(apart, places)
     total = samples.sum()
-    sides = [
-        tuple(float((np.abs(side) <= limit).mean()) for limit in (0.5, 1.0, 1.5))
-        for side in (slat, pixieverse)
-    ]
     weights = counts / counts.sum()
     return Agreement(
         directions_near=float(weights @ np.minimum(near, _MOST)),
@@ -51,9 +47,15 @@ def agreement_of(slat: Array, pixieverse: Array, normals: Array, places: Array) 
         blocks_near=float(samples[median <= 0.5].sum() / total),
         blocks_middle=float(samples[median <= 1.0].sum() / total),
         blocks_far=float(samples[median <= 1.5].sum() / total),
-        within_slat=(sides[0][0], sides[0][1], sides[0][2]),
-        within_pixieverse=(sides[1][0], sides[1][1], sides[1][2]),
+        within_slat=shares_within(np.abs(slat), 0.5, 1.0, 1.5),
+        within_pixieverse=shares_within(np.abs(pixieverse), 0.5, 1.0, 1.5),
     )
+
+
+def shares_within(apart: Array, *limits: float) -> tuple[float, float, float]:
+    """Return the shares of samples that lie no farther apart (N,) than each of three limits."""
+    near, middle, far = (float((apart <= limit).mean()) for limit in limits)
+    return near, middle, far
 
 
 def _by_direction(apart: Array, normals: Array) -> tuple[Array, Array, NDArray[np.intp]]:

@@ -61,7 +61,7 @@ class Trial:
 def try_out(slat: Surface, pixie: Surface, pose: Similarity, samples: int = TRIAL_SAMPLES) -> Trial:
     """Fit on the samples of every other block, and score on the others."""
     residuals = Residuals(slat, pixie, pose, samples)
-    start = residuals.start()
+    start = Warp.unbent(pose)
     unseen = residuals.held_out()
     seen = np.flatnonzero(~unseen)
     before = residuals.kernels(start)
@@ -97,7 +97,7 @@ def deform_if_earned(
     decide, ``affine`` and ``deformable`` fit that without asking, the others nothing.
     """
     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
-    start = residuals.start()
+    start = Warp.unbent(pose)
     before = float(residuals.kernels(start).mean())
     evidence = float("nan"), float("nan")
     wanted: str = parameters.model if parameters.model in ("affine", "deformable") else ""
@@ -142,7 +142,7 @@ def earned(trial: Trial) -> str:
 def fit(slat: Surface, pixie: Surface, pose: Similarity, trial: Trial, model: str) -> Warp:
     """Fit an ``affine`` or ``deformable`` warp on all samples, from where a trial ended."""
     residuals = Residuals(slat, pixie, pose, FIT_SAMPLES)
-    everything = residuals.all_samples()
+    everything = np.arange(len(residuals.places))
     if model == "affine":
         return residuals.fit_affine(trial.affine, AFFINE_TAUS[-3:], everything)
     warp = trial.bent

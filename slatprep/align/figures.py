@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slatprep.align.agreement import agreement_of
+from slatprep.align.agreement import agreement_of, shares_within
 from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import surface_of
@@ -37,7 +37,7 @@ def measure_figures(
     pixie = surface_of(above(field.occupancy, alignment.ground))
     pose = Similarity.of(alignment.transform)
     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
-    warp = residuals.start()
+    warp = Warp.unbent(pose)
     here, back = residuals.at(warp)
     # The two sides' residuals have the offset with opposite signs.
     offset = float(np.median(np.concatenate([here, -back])))
@@ -60,14 +60,13 @@ def fit_figures(
     here, back = residuals.at(warp)
     both = np.abs(np.concatenate([here, back]))
     slat, pixieverse = (float((1.0 / (1.0 + side**2)).mean()) for side in (here, back))
-    within = [float((both <= limit).mean()) for limit in (1.0, 2.0, 3.0)]
     figures = FitFigures(
         score_slat=slat,
         score_pixieverse=pixieverse,
         score_similarity=0.5 * (slat + pixieverse) if before is None else before,
         evidence_affine=evidence[0],
         evidence_deformable=evidence[1],
-        within=(within[0], within[1], within[2]),
+        within=shares_within(both, 1.0, 2.0, 3.0),
         offset=warp.offset,
         roughness=float(np.median(both)),
         agreement=agreement_of(here, back, residuals.normals(), residuals.places),

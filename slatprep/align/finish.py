@@ -20,7 +20,7 @@ from slatprep.align.pair import (
     TIE,
     Array,
     Pair,
-    far_from_all,
+    far_apart,
     scale_penalty,
 )
 from slatprep.align.pose import Pose, Similarity
@@ -65,16 +65,14 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     order = np.argsort(-(ranks + standing), kind="stable")
     highest = max(pose.merit for pose, _ in contested)
     points = pair.slat.subset(RANK_SAMPLES).points
-    kept: list[tuple[Pose, Deformed, Array]] = []
-    for k in order:
-        pose, bent = contested[k]
-        places = places_of(pose.similarity, bent.warp, points)
-        if far_from_all(places, (there for _, _, there in kept)):
-            below = max(float(ranks[order[0]] - ranks[k]), 0.0)
-            bonus = highest - below - pose.score
-            kept.append((replace(pose, bonus=bonus, standing=0.0), alike[k], places))
-    (best, *near), (free, *fits), _ = zip(*kept, strict=True)
-    deformed = contested[order[0]][1]
+    fitted = [contested[k] for k in order]
+    kept = far_apart([places_of(pose.similarity, bent.warp, points) for pose, bent in fitted])
+    merits = highest - np.maximum(ranks[order[0]] - ranks[order], 0.0)
+    best, *near = [
+        replace(fitted[k][0], bonus=float(merits[k]) - fitted[k][0].score, standing=0.0)
+        for k in kept
+    ]
+    (free, *fits), deformed = [alike[order[k]] for k in kept], fitted[0][1]
     return [best, *_told_apart(pair, free, near, fits), *rest], deformed
 
 

@@ -73,7 +73,7 @@ def _reflected(pair: Pair, found: Similarity) -> list[Pose]:
     """
     flip, centre = np.diag([-1.0, 1.0, 1.0]), pair.slat.centroid
     poses = []
-    for normal in (*pair.axes.T, *np.eye(3)):
+    for normal in (*pair.principal[0].T, *np.eye(3)):
         reflect = np.eye(3) - 2.0 * np.outer(normal, normal)
         shift = flip @ (reflect @ (found.shift - centre) + centre)
         poses.append(Pose(found._replace(rotation=flip @ reflect @ found.rotation, shift=shift)))

@@ -53,12 +53,6 @@ def scale_penalty(similarity: Similarity) -> float:
     return float(SCALE_PRIOR * (np.log(similarity.scale) / 0.25) ** 2)
 
 
-def far_from_all(places: Array, others: Iterable[Array]) -> bool:
-    """Whether deformed places (N, 3) are those of another placement than all others."""
-    apart = (np.sqrt(((places - other) ** 2).sum(axis=1).mean()) for other in others)
-    return all(distance >= 2.0 * DISTINCT for distance in apart)
-
-
 @kernel()
 def first_of_each(places, distance, most):  # type: ignore[no-untyped-def]
     """Choose at most so many of places (n, 12), best first, none near to a better one."""
@@ -74,6 +68,16 @@ def first_of_each(places, distance, most):  # type: ignore[no-untyped-def]
     return kept[:found]
 
 
+def far_apart(places: Sequence[Array]) -> list[int]:
+    """Choose placements, best first, none near to a better one, by deformed places (N, 3)."""
+    kept: list[int] = []
+    for k, own in enumerate(places):
+        apart = (np.sqrt(((own - places[other]) ** 2).sum(axis=1).mean()) for other in kept)
+        if all(distance >= 2.0 * DISTINCT for distance in apart):
+            kept.append(k)
+    return kept
+
+
 class Pair:
     """Two surfaces and what the search asks of them."""
 
@@ -84,12 +88,8 @@ class Pair:
         self.may_deform = parameters.model in ("auto", "affine", "deformable")
 
     @cached_property
-    def axes(self) -> Array:
-        """The principal axes of the SLAT's samples, the columns of a matrix (3, 3)."""
-        return self._principal[0]
-
-    @cached_property
-    def _principal(self) -> tuple[Array, Array]:
+    def principal(self) -> tuple[Array, Array]:
+        """Principal axes of the SLAT's samples, columns (3, 3): unit vectors; as long as spread."""
         points = self.slat.points
         covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
         variances, axes = np.linalg.eigh(covariance)
@@ -174,7 +174,7 @@ class Pair:
         if affines is not None:
             matrices, moved = inverse @ affines[:, :, :3], moved + affines[:, :, 3]
         centre = matrices @ self.slat.centroid + np.einsum("nij,nj->ni", inverse, moved)
-        return np.concatenate([(matrices @ self._principal[1]).reshape(-1, 9), centre], axis=1)
+        return np.concatenate([(matrices @ self.principal[1]).reshape(-1, 9), centre], axis=1)
 
     def distinct(self, poses: Sequence[Pose]) -> list[Pose]:
         """Return the poses best first, without those that repeat a better one."""

@@ -50,14 +50,6 @@ class Residuals:
         self._lines = Lines.at(np.concatenate([here.points, carried]))
         self._pixie_rows = len(here.points)
 
-    def start(self) -> Warp:
-        """Return the warp that leaves the similarity as it is."""
-        return Warp.unbent(self._pose)
-
-    def all_samples(self) -> NDArray[np.intp]:
-        """Return the rows of all samples."""
-        return np.arange(len(self._lines.places))
-
     def held_out(self) -> NDArray[np.bool_]:
         """Return which samples lie in the blocks that a trial does not see."""
         low = self.surface.points.min(axis=0) - 1.0

@@ -16,9 +16,8 @@ from slatprep.align.pair import (
     POLISH_TAUS,
     RANK_SAMPLES,
     RANK_STANDING,
-    Array,
     Pair,
-    far_from_all,
+    far_apart,
     first_of_each,
     scale_penalty,
 )
@@ -104,11 +103,8 @@ def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[P
         places = places_of(pose.similarity, trial.bent, points)
         ranked.append((replace(pose, bonus=bonus, standing=standing), places))
     ranked.sort(key=lambda entry: -entry[0].rank)
-    kept: list[tuple[Pose, Array]] = []
-    for pose, places in ranked:
-        if far_from_all(places, (p for _, p in kept)):
-            kept.append((pose, places))
-    return pair.distinct([*(pose for pose, _ in kept), *poses[len(near) :]])
+    kept = [ranked[k][0] for k in far_apart([places for _, places in ranked])]
+    return pair.distinct([*kept, *poses[len(near) :]])
 
 
 def stretched(pair: Pair, near: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:

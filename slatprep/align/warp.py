@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 
 NO_SPACING = 1e6
+"""Of a warp without a lattice."""
 
 
 class Warp(NamedTuple):
@@ -33,20 +34,10 @@ class Warp(NamedTuple):
         """Return the warp that leaves a similarity as it is."""
         return cls(np.eye(3, 4), pose.offset)
 
-    @property
-    def has_lattice(self) -> bool:
-        """Whether there is a lattice, be it all zeros."""
-        return self.spacing < NO_SPACING
-
-    @property
-    def is_bent(self) -> bool:
-        """Whether there is more to it than the affine part."""
-        return bool(self.coefficients.any())
-
     def moved(self, points: Array) -> Array:
         """Return points (N, 3) of the SLAT frame as the warp moves them."""
         moved: Array = points @ self.affine[:, :3].T + self.affine[:, 3]
-        if self.has_lattice:
+        if self.spacing < NO_SPACING:
             added = np.empty_like(moved)
             displacements(points, self.origin, self.spacing, self.coefficients, added)
             moved += added
@@ -56,7 +47,7 @@ class Warp(NamedTuple):
         """Return it bounded, not folded and rounded; `points` (N, 3) are the SLAT's."""
         affine = self.affine.copy()
         affine[:, 3] *= VOXEL_SIZE
-        bent = self.is_bent
+        bent = bool(self.coefficients.any())
         return make_deformation(
             affine,
             self.origin * VOXEL_SIZE if bent else np.zeros(3),

@@ -55,8 +55,9 @@ def class_confidence(
 ) -> NDArray[np.float32]:
     """Return how likely the class of each voxel (N,) is right, 0 where not valid.
 
-    `confidence` is the asset's: that of its object times that of its placement. Placements that fit equally
-    well are taken as equally likely: the model's probability counts for those with the same class.
+    `confidence` is the asset's: that of its object times that of its placement. Placements that fit
+    equally well are taken as equally likely: the model's probability counts for those with the same
+    class.
     """
     likely = np.zeros(len(valid), dtype=np.float32)
     if valid.any():

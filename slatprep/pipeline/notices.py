@@ -86,10 +86,10 @@ def shared_sources(new: NextStore) -> Iterator[str]:
     """Yield which objects have one SLAT, and which new ones have one grid, by their content."""
     slats: defaultdict[object, list[int]] = defaultdict(list)
     grids: defaultdict[object, list[int]] = defaultdict(list)
-    means, stds = (new.column(name) for name in ("latent_mean", "latent_std"))
+    moments = moments_of(new.rows, new.stores)
     for at, row in enumerate(new.rows):
-        if not np.isnan(means[at]).any():
-            slats[row.n_voxels, means[at].tobytes(), stds[at].tobytes()].append(at)
+        if moments[at]:
+            slats[row.n_voxels, moments[at]].append(at)
         if row.spooled:
             grids[row.columns["grid"]].append(at)
     objects = new.column("object_id")
@@ -144,11 +144,10 @@ def _first(names: Sequence[str]) -> str:
 def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
     """Yield what a person should know about whether the latents of a store are standardised."""
     latents = new.contents.latents
-    means, stds = (new.column(name) for name in ("latent_mean", "latent_std"))
     known = [
         (row.asset_id, moments)
-        for row, mean, std in zip(new.rows, means, stds, strict=True)
-        if row.n_voxels >= ENOUGH and (moments := moments_of(mean, std))
+        for row, moments in zip(new.rows, moments_of(new.rows, new.stores), strict=True)
+        if row.n_voxels >= ENOUGH and moments
     ]
     looks = {name: look_standardised(moments, latents) for name, moments in known}
     if latents.standardised and standardised == "auto":

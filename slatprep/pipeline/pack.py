@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import groupby
 from pathlib import Path
@@ -29,7 +29,7 @@ from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import put_objects
 from slatprep.storage.upload import Staged
-from slatprep.store.layout import ARRAYS, RECORD_ARRAY, arrays_with, overlaps
+from slatprep.store.layout import ARRAYS, RECORD_ARRAY, arrays_with, edges_of, overlaps
 from slatprep.store.runs import Run, Runs, runs_of
 from slatprep.store.shard_writer import ShardWriter, Written
 from slatprep.store.writer import (
@@ -38,7 +38,6 @@ from slatprep.store.writer import (
     create_store,
     cuts_of,
     finish_store,
-    merges,
     open_for_writing,
     packing_of,
     shards,
@@ -99,7 +98,7 @@ def _made(
     here, written = remote or path, dict[str, Written]()
     # Those of grids, which take longest, first: so the last shards keep all workers at work.
     todo.sort(key=lambda shard: shard.group != "grid")
-    how = new.normalization, new.contents.background
+    how = new.normalization, new.contents.background, new.merged
     tasks = ((here, work.spool, new.stores, shard, *how) for shard in todo)
     for done, (shard, counts, files) in enumerate(run_unordered(write_shard, tasks, jobs), 1):
         if shard.group in clipped:
@@ -127,9 +126,11 @@ def write_shard(
     shard: Shard,
     normalization: Normalization,
     background: int,
+    merged: bool,
 ) -> tuple[Shard, NDArray[np.int64], dict[str, Written]]:
     """Write one shard of every array of its group into the store that is made at `path`.
 
+    It has arrays of `merged` labels, or none.
     Returns the shard, how many values of the spool's assets lay outside the range, (A, P) by asset
     of the shard and property, and what was written by file. No other task may have the shard.
     """
@@ -139,13 +140,13 @@ def write_shard(
     with ExitStack() as stack:
         writers = {
             array: stack.enter_context(ShardWriter(path, array, shard.start))
-            for array in arrays_in(shard.group, merges(path))
+            for array in arrays_in(shard.group, merged)
         }
         for run, start, stop in shard.pieces:
             if run is not None:
                 _copy_chunks(writers, stores[run.store], start + run.shift, stop + run.shift)
                 continue
-            assets = list(owners(shard, start, stop))
+            assets = overlaps(shard.offsets, start, stop)
             for there, own in groupby(assets, lambda one: _follows(shard.rows[one[0]], one[0])):
                 if there is not None:
                     _move_rows(writers, stores[there[0]], shard, list(own), normalization)
@@ -168,15 +169,6 @@ def arrays_in(group: str, merged: bool) -> list[str]:
         return [RECORD_ARRAY]
     layouts = arrays_with(merged)
     return [layout.name for layout in layouts if layout.name.startswith(f"{group}/")]
-
-
-def owners(shard: Shard, start: int, stop: int) -> Iterator[tuple[int, slice]]:
-    """Yield the assets that own rows of a shard, and which of their own those are."""
-    if shard.group == "voxel":
-        yield from overlaps(shard.offsets, start, stop)
-    else:
-        first = shard.start
-        yield from ((asset, slice(0, 1)) for asset in range(start - first, stop - first))
 
 
 def _follows(where: Where, asset: int) -> tuple[int, int] | None:
@@ -238,13 +230,9 @@ def _move_rows(
         return
     held = source.store
     (first, begin), (last, end) = assets[0], assets[-1]
-    rows = [int(shard.rows[asset][1]) for asset in (first, last)]
-    start, stop = rows[0], rows[1] + 1
-    if shard.group == "voxel":
-        start, stop = (
-            int(held.offsets[rows[0]]) + begin.start,
-            int(held.offsets[rows[1]]) + end.stop,
-        )
+    edges = edges_of(shard.group, held.offsets.tolist())
+    start = edges[int(shard.rows[first][1])] + begin.start
+    stop = edges[int(shard.rows[last][1])] + end.stop
     change = _renormaliser(source.normalization, normalization)
     names = [name for name in writers if held.holds(name)]
     at_a_time = _ROWS_MOVED if shard.group == "voxel" else 1
@@ -287,9 +275,8 @@ def _runs(path: Path, group: str, new: NextStore) -> Runs:
     alike = [_packs_alike(path, group, new, source) for source in new.stores]
     if not any(alike):
         return Runs()
-    voxel = group == "voxel"
-    before = [s.store.offsets.tolist() if voxel else range(len(s.store) + 1) for s in new.stores]
-    ends = new.offsets if voxel else range(len(new.rows) + 1)
+    before = [edges_of(group, source.store.offsets.tolist()) for source in new.stores]
+    ends = edges_of(group, new.offsets)
     spans = (
         Run(ends[k], ends[k + 1], row.store, before[row.store][row.row] - ends[k])
         for k, row in enumerate(new.rows)

@@ -22,7 +22,7 @@ from slatprep.normalize import normalize_change
 from slatprep.parameters import StoreParameters
 from slatprep.records import Contents, Finished, LatentMoments, Normalization, Place
 from slatprep.store.attributes import store_attributes
-from slatprep.store.integrity import file_findings, metadata_findings
+from slatprep.store.integrity import digests_in, file_findings, metadata_findings
 from slatprep.store.layout import RECORD_ARRAY, RECORDS_IN_SHARD
 from slatprep.store.reader import Store, open_store
 from slatprep.store.record import AssetRecord
@@ -73,12 +73,7 @@ class SourceStore:
     @cached_property
     def files(self) -> dict[str, Written]:
         """Bytes and SHA-256 of its files by name, as it holds them."""
-        store, files = self.store, self.store.shape("file/name")[0]
-        names, *told = (store.read_rows(f"file/{n}", 0, files) for n in ("name", "size", "sha256"))
-        return {
-            str(name): Written(int(size), str(digest))
-            for name, size, digest in zip(names, *told, strict=True)
-        }
+        return digests_in(self.store)
 
     @cached_property
     def records(self) -> StoredRecords:
@@ -216,11 +211,13 @@ Where = str | tuple[int, int, Names | None]
 """Where a row's arrays lie: its key in the spool, or its store, its row there and its new names."""
 
 
-def moments_of(mean: Any, std: Any) -> LatentMoments | None:
-    """Return the moments of channels (C,); None where they are NaN."""
-    if np.isnan(mean).any():
-        return None
-    return LatentMoments(tuple(np.asarray(mean).tolist()), tuple(np.asarray(std).tolist()))
+def moments_of(rows: Sequence[Row], stores: Sequence[SourceStore]) -> list[LatentMoments | None]:
+    """Return the moments of the latents of each row; None where they are not known."""
+    columns = (column(name, rows, stores) for name in ("latent_mean", "latent_std"))
+    return [
+        None if np.isnan(mean).any() else LatentMoments(tuple(mean.tolist()), tuple(std.tolist()))
+        for mean, std in zip(*columns, strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)

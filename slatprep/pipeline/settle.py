@@ -102,11 +102,7 @@ def resolved_contents(
     rows: Sequence[Row], stores: Sequence[SourceStore], declared: Contents, standardised: str
 ) -> Contents:
     """Return what a store holds, its latents as `resolve_latents` finds them to be."""
-    means, stds = (column(name, rows, stores) for name in ("latent_mean", "latent_std"))
-    moments = [
-        (row.n_voxels, moments_of(mean, std))
-        for row, mean, std in zip(rows, means, stds, strict=True)
-    ]
+    moments = list(zip((row.n_voxels for row in rows), moments_of(rows, stores), strict=True))
     return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
 
 

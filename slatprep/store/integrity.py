@@ -35,6 +35,7 @@ from slatprep.store.contract import (
 )
 from slatprep.store.layout import ARRAYS, FILE, FILES, MERGED
 from slatprep.store.reader import Store
+from slatprep.store.shard_writer import Written
 from slatprep.workers.local import Jobs, run_unordered
 
 ATTRIBUTES = "zarr.json#attributes"
@@ -165,6 +166,13 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
             yield from array_findings(layout, arrays[layout.name], sizes)
 
 
+def digests_in(store: Store) -> dict[str, Written]:
+    """Return bytes and SHA-256 of the files of a store by name, as it holds them."""
+    files = store.shape(f"{FILE}/name")[0]
+    columns = (store.read_rows(layout.name, 0, files).tolist() for layout in FILES)
+    return {name: Written(*told) for name, *told in zip(*columns, strict=True)}
+
+
 def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[Finding]]:
     """Compare every file of a store, or those whose names begin with `below`, with its digest.
 
@@ -172,17 +180,13 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
     themselves included, and what is missing, additional or changed.
     """
     try:
-        names, sizes, digests = (
-            store.read_rows(f"file/{name}", 0, store.shape("file/name")[0])
-            for name in ("name", "size", "sha256")
-        )
+        expected = digests_in(store)
     except StoreError as error:
         return 0, {Finding("file", "", str(error), "a digest of every file")}
-    expected = {str(n): (int(s), str(d)) for n, s, d in zip(names, sizes, digests, strict=True)}
     findings = set()
-    attributes = expected.pop(ATTRIBUTES, (0, ""))
-    if attributes_digest(store.attributes) != attributes[1]:
-        findings.add(Finding("zarr.json", "", "the attributes changed", f"SHA-256 {attributes[1]}"))
+    attributes = expected.pop(ATTRIBUTES, Written(0, "")).sha256
+    if attributes_digest(store.attributes) != attributes:
+        findings.add(Finding("zarr.json", "", "the attributes changed", f"SHA-256 {attributes}"))
     files = storage_of(store.path).files()
     # The root's metadata and the arrays of digests have no digest themselves.
     present = {name for name in files if name != "zarr.json" and not name.startswith(f"{FILE}/")}

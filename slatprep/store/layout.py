@@ -230,6 +230,14 @@ def row_ranges(total: int, per_shard: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + per_shard, total)
 
 
+def edges_of(group: str, offsets: Sequence[int]) -> Sequence[int]:
+    """Return the first row of each asset in arrays of a group, and the last one's end.
+
+    Of arrays other than ``voxel/*``, where `offsets` are those, an asset has one row.
+    """
+    return offsets if group == "voxel" else range(len(offsets))
+
+
 def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, slice]]:
     """Yield which assets own the rows ``start:stop``, and which of their own rows those are.
 

@@ -44,8 +44,7 @@ class Shard:
     rows : sequence
         Where the arrays of the assets lie that have rows in it, in a form that the writer knows.
     offsets : sequence of int
-        ``voxel`` alone: first row of each of them in the store, and the last
-        one's end.
+        First row of each of them in the store, and the last one's end.
     pieces : sequence of Piece
         Its rows, and which of them an older store has in whole chunks.
     """
@@ -118,11 +117,6 @@ def _codecs(array: layout.ArrayLayout, level: int) -> dict[str, Any]:
     return {"compressors": (compressors[array.packing], Crc32cCodec())}
 
 
-def merges(path: Place) -> bool:
-    """Whether a store that `create_store` made has arrays of merged labels."""
-    return all((path / array.name).is_dir() for array in layout.MERGED)
-
-
 def packing_of(array: Place) -> object:
     """Return how an array is cut into chunks, and how those are packed."""
     document = read_metadata(array / "zarr.json")
@@ -154,17 +148,14 @@ def shards(
     chunks of the same bytes, and `taken` which shards, by group and number, are left out.
     """
     for group, (chunk, per_shard) in cuts_of(parameters, offsets[-1]).items():
-        own, total = runs.get(group, Runs()), offsets[-1] if group == "voxel" else len(rows)
-        for number, (start, stop) in enumerate(layout.row_ranges(total, per_shard)):
+        own, edges = runs.get(group, Runs()), layout.edges_of(group, offsets)
+        for number, (start, stop) in enumerate(layout.row_ranges(edges[-1], per_shard)):
             if (group, number) in taken:
                 continue
             pieces = tuple(own.pieces(start, stop, chunk))
-            first, last = start, stop
-            begins: Sequence[int] = ()
-            if group == "voxel":
-                owners = [asset for asset, _ in layout.overlaps(offsets, start, stop)]
-                first, last = owners[0], owners[-1] + 1
-                begins = tuple(offsets[first : last + 1])
+            owners = [asset for asset, _ in layout.overlaps(edges, start, stop)]
+            first, last = owners[0], owners[-1] + 1
+            begins = tuple(edges[first : last + 1])
             yield Shard(group, start, stop, first, rows[first:last], begins, pieces)
 
 

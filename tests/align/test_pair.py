@@ -23,7 +23,7 @@ from slatprep.align.pair import (
     SURVIVORS,
     TIE,
     Pair,
-    far_from_all,
+    far_apart,
 )
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.search import (
@@ -326,10 +326,12 @@ def test_deformed_places_are_apart_from_twice_the_usual_distance_on():
         ((-2 * DISTINCT, 0, 0), True), ((0, 2.9, 0), False), ((1.6, 1.8, -1.9), True),
         ((-1.6, 1.6, 1.6), False),
     ):  # fmt: skip
-        assert far_from_all(points, [points + shift]) == apart
-        assert far_from_all(points, [points + 99, points - shift]) == apart
-        assert far_from_all(points, [points + 2**0.5 * half * shift]) == apart
-    assert far_from_all(points, [])
+        for better in (
+            [points + shift], [points + 99, points - shift], [points + 2**0.5 * half * shift],
+        ):  # fmt: skip
+            every = list(range(len(better) + 1))
+            assert far_apart([*better, points]) == (every if apart else every[:-1])
+    assert far_apart([points, points, points + 99]) == [0, 2]
 
 
 class _Squashed:

@@ -14,7 +14,7 @@ from slatprep.parameters import StoreParameters
 from slatprep.records import Normalization, PropertyRange
 from slatprep.store.integrity import write_digests
 from slatprep.store.runs import Run, runs_of
-from slatprep.store.writer import Shard, create_store, finish_store, merges, shards
+from slatprep.store.writer import Shard, create_store, finish_store, shards
 
 
 def arrays_of(store: Path) -> dict[str, zarr.Array]:
@@ -57,8 +57,6 @@ def test_arrays_of_merged_labels_are_there_where_labels_are_merged(tmp_path):
     assert several.keys() - one.keys() == {"voxel/spread", "voxel/votes"}
     assert several["voxel/spread"].shape == (6, 3)
     assert several["voxel/votes"].shape == (6,)
-    assert merges(tmp_path / "several")
-    assert not merges(tmp_path / "one")
 
 
 def test_bytes_that_recur_in_a_column_take_no_room(tmp_path):
@@ -92,9 +90,9 @@ def test_a_shard_says_where_the_arrays_of_just_those_assets_lie_that_have_rows_i
     assert list(shards(where, [0, 5, 12, 20], parameters, grids, {("voxel", 1)})) == [
         Shard("voxel", 0, 8, 0, where[:2], (0, 5, 12), ((None, 0, 8),)),
         Shard("voxel", 16, 20, 2, where[2:], (12, 20), ((None, 16, 20),)),
-        Shard("grid", 0, 2, 0, where[:2], (), ((None, 0, 1), (run, 1, 2))),
-        Shard("grid", 2, 3, 2, where[2:], (), ((run, 2, 3),)),
-        Shard("record", 0, 3, 0, where, (), ((None, 0, 3),)),
+        Shard("grid", 0, 2, 0, where[:2], (0, 1, 2), ((None, 0, 1), (run, 1, 2))),
+        Shard("grid", 2, 3, 2, where[2:], (2, 3), ((run, 2, 3),)),
+        Shard("record", 0, 3, 0, where, (0, 1, 2, 3), ((None, 0, 3),)),
     ]
 
 
