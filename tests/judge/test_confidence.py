@@ -17,7 +17,7 @@ from slatprep.inspect.score import Truth, read_truth
 from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, judge, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
-from slatprep.judge.confidence import causes_of_doubt, right_placements, same_objects
+from slatprep.judge.confidence import causes_of_doubt
 from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
 from slatprep.judge.evidence import (
     FIGURES,
@@ -94,7 +94,8 @@ def rated(targets: np.ndarray, decoys: np.ndarray) -> ErrorRates:
 
 def called_good(targets: np.ndarray, decoys: np.ndarray) -> dict[str, np.ndarray]:
     return {
-        name: same_objects(figures) * right_placements(figures) >= THRESHOLDS.good_confidence
+        name: np.multiply(*(model.probability(figures) for model in (SAME_OBJECT, PLACEMENT)))
+        >= THRESHOLDS.good_confidence
         for name, figures in (("good", targets), ("good_decoys", decoys))
     }
 
