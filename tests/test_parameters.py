@@ -53,12 +53,14 @@ def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
     (folder / "map.csv").touch()
     (folder / "ranges.toml").touch()
     tables = '[pairing]\nmap = "map.csv"\n[normalize]\nranges = "./ranges.toml"\n'
-    path = write(folder, MINIMAL + tables)
+    patterns = 'pattern = ["a/{id}.npz", "b/{id}.npz"]\n'
+    path = write(folder, MINIMAL + patterns + tables)
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
     parameters = load_parameters(path)
     assert parameters.pixieverse.root == folder / "grids"
     assert parameters.pairing.map == folder / "map.csv"
     assert parameters.normalize.ranges == str(folder / "ranges.toml")
+    assert parameters.slat.pattern == ("a/{id}.npz", "b/{id}.npz")
 
 
 def test_options_win_over_the_file(folder):
@@ -92,11 +94,6 @@ def test_lists_of_ids_lie_beside_the_definition(folder):
     for rule in ("pixie", "category:tree", "hash"):
         path = write(folder, MINIMAL + named + f'"{rule}"\n')
         assert load_parameters(path).normalize.split_by == rule
-
-
-def test_patterns_are_lists(folder):
-    path = write(folder, MINIMAL + 'pattern = ["a/{id}.npz", "b/{id}.npz"]\n')
-    assert load_parameters(path).slat.pattern == ("a/{id}.npz", "b/{id}.npz")
 
 
 @pytest.mark.parametrize(
