@@ -23,7 +23,7 @@ from slatprep.export.formats import (
     Writer,
     annotated_points,
 )
-from slatprep.records import MATERIAL_COLOURS, PROPERTY_COLUMNS, RESOLUTION
+from slatprep.records import COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.arrays import write_ply
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
@@ -41,11 +41,6 @@ VERTEX = np.dtype(
 
 UNITS = "density kg/m^3, E Pa, nu 1"
 """The units, a comment in every PLY written here."""
-
-COLOURS = np.zeros((256, 3), dtype=np.uint8)
-"""Red, green and blue of every material id."""
-for _material, _colour in MATERIAL_COLOURS.items():
-    COLOURS[_material] = tuple(bytes.fromhex(_colour[1:]))
 
 _COMMENTS = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",

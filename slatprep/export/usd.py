@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
 from slatprep.export import formats
-from slatprep.export.ply import COLOURS
-from slatprep.records import MATERIAL_CLASSES, RESOLUTION
+from slatprep.records import COLOURS, MATERIAL_CLASSES, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset

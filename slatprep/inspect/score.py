@@ -10,7 +10,7 @@ column for each name in ``columns`` (P,).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -214,7 +214,8 @@ def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
 
 def _true_values(path: Path, count: int) -> tuple[tuple[str, ...], NDArray[np.floating[Any]]]:
     """Return the true properties (N, P) of SLAT voxels, and their names."""
-    arrays = _arrays(path, _VALUES)
+    data, _ = load_source(path, path.parent, "truth")
+    arrays = npz_arrays(data, path, _VALUES)
     names, values = tuple(map(str, arrays["columns"])), arrays["properties"]
     if values.shape != (count, len(names)):
         raise InputError(path, f"properties has shape {values.shape}", f"({count}, {len(names)})")
@@ -297,16 +298,12 @@ def _share(flags: NDArray[np.bool_]) -> float:
     return float(flags.mean()) if flags.size else float("nan")
 
 
-def _arrays(path: Path, specs: Mapping[str, ArraySpec], **how: bool) -> dict[str, NDArray[Any]]:
-    data, _ = load_source(path, path.parent, "truth")
-    return npz_arrays(data, path, specs, **how)
-
-
 def read_truth(path: Path) -> Truth:
     """Read one asset's truth; InputError if the file cannot be read, or its numbers are none."""
     try:
-        arrays = _arrays(path, _TRUTH)
-        places = _arrays(path, _PLACES, partial=True).get("places")
+        data, _ = load_source(path, path.parent, "truth")
+        arrays = npz_arrays(data, path, _TRUTH)
+        places = npz_arrays(data, path, _PLACES, partial=True).get("places")
     except InputError as error:
         raise InputError(path, f"cannot be read ({error.fault})", error.expected) from None
     transform = arrays["transform"].astype(np.float64)

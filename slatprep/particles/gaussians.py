@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError
-from slatprep.export.ply import COLOURS
 from slatprep.particles.read import SAVED_AXES, Axes
+from slatprep.records import COLOURS
 from slatprep.storage.arrays import write_ply
 
 _NEAREST = 8

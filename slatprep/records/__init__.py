@@ -59,6 +59,7 @@ from slatprep.records.tables import (
     BACKGROUND,
     CLASS_COLOURS,
     CLASS_NAME,
+    COLOURS,
     FEATS_MEAN,
     FEATS_STD,
     MANY_BACKGROUND,

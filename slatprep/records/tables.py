@@ -93,6 +93,11 @@ MATERIAL_COLOURS = {
 }
 """The same by material id, as the store holds it; of more classes, the others' from 8 on."""
 
+COLOURS = np.zeros((256, 3), dtype=np.uint8)
+"""Red, green and blue of every material id."""
+for _material, _colour in MATERIAL_COLOURS.items():
+    COLOURS[_material] = tuple(bytes.fromhex(_colour[1:]))
+
 
 def words_of(given: Collection[str]) -> Collection[str]:
     """Return words of which one alone may be given as a text."""

@@ -2,6 +2,9 @@
 
 import ast
 import importlib.util
+import json
+import subprocess
+import sys
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
@@ -133,3 +136,17 @@ def test_every_way_reads_every_asset_alike(mixed_build, tmp_path):
             assert np.array_equal(arrays["coords"], asset.coords)
             assert np.array_equal(arrays["feats"], asset.feats)
             assert np.array_equal(arrays["properties"], asset.properties, equal_nan=True)
+
+
+def test_damage_is_found_healed_or_without_meaning():
+    """The short version of ``benchmarks/damage.py``: no flipped bit and no gross damage harms."""
+    script = str(ROOT / "benchmarks" / "damage.py")
+    command = [sys.executable, script, "--flips", "150", "--stores", "30", "--seed", "4"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["harm"] == 0
+    outcomes = ("found by verify", "healed by the next build", "without meaning",
+                "costs the next build some hashing")  # fmt: skip
+    assert sum(told.get(outcome, 0) for outcome in outcomes) == told["flips"] == 150
+    assert sum(count for name, count in told.items() if ": exit code" in name) == 30

@@ -78,6 +78,14 @@ def rewrite(store: Path, array: str, rows: object, values: object) -> None:
     zarr.open_group(store, mode="r+", use_consolidated=False)[array][rows] = values
 
 
+def edit_record(store: Path, row: int, edit: Callable[[dict[str, Any]], object]) -> None:
+    """Change the record of an asset in place; its digest stays."""
+    group = zarr.open_group(store, mode="r+", use_consolidated=False)
+    record = json.loads(str(group["asset/record"][row]))
+    edit(record)
+    group["asset/record"][row] = json.dumps(record)
+
+
 def edit_json(path: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     """Change a JSON file in place."""
     document = json.loads(path.read_text())

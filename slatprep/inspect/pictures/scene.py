@@ -18,7 +18,7 @@ from slatprep.geometry.frames import (
 from slatprep.geometry.voxels import boundary, occupancy_of, outer_boundary, voxels_of
 from slatprep.inspect.pictures.canvas import DISTANCE_COLOURS
 from slatprep.inspect.pictures.voxels import View, view_rotation
-from slatprep.records import MATERIAL_COLOURS, RESOLUTION
+from slatprep.records import COLOURS, RESOLUTION
 from slatprep.store.reader import StoredAsset
 from slatprep.store.records import StoredRecords
 
@@ -162,10 +162,7 @@ def views(scene: Scene, size: int) -> tuple[View, ...]:
 
 def class_colours(material: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the colour (N, 3) in 0..1 of each material id (N,)."""
-    table = np.zeros((256, 3))
-    for index, colour in MATERIAL_COLOURS.items():
-        table[index] = rgb(colour)
-    return table[material]
+    return COLOURS[material] / 255.0
 
 
 def distance_colours(

@@ -39,7 +39,7 @@ from slatprep.geometry.frames import apply_transform, invert_transform, voxel_ce
 from slatprep.geometry.voxels import boundary, filled
 from slatprep.inspect.tallies import Tally, tally
 from slatprep.pipeline.rows import SourceStore
-from slatprep.records import MATERIAL_COLOURS, RESOLUTION, UNANNOTATED
+from slatprep.records import COLOURS, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
 VIEWS = 3
@@ -134,12 +134,10 @@ def sheet(pictures: Sequence[NDArray[np.uint8]]) -> bytes:
     from PIL import Image
 
     rows = -(-len(pictures) // COLUMNS)
-    height, width = SIDE, SIDE * VIEWS
-    canvas = np.zeros((rows * height, COLUMNS * width), dtype=np.uint8)
-    for number, picture in enumerate(pictures):
-        row, column = divmod(number, COLUMNS)
-        canvas[row * height :, column * width :][:height, :width] = picture
-    image = Image.fromarray(canvas, mode="P")
+    cells = np.zeros((rows * COLUMNS, SIDE, SIDE * VIEWS), dtype=np.uint8)
+    cells[: len(pictures)] = pictures
+    canvas = cells.reshape(rows, COLUMNS, *cells.shape[1:]).swapaxes(1, 2)
+    image = Image.fromarray(canvas.reshape(rows * SIDE, -1), mode="P")
     image.putpalette(palette().tobytes())
     file = io.BytesIO()
     image.save(file, "PNG", optimize=True, transparency=0)
@@ -148,8 +146,7 @@ def sheet(pictures: Sequence[NDArray[np.uint8]]) -> bytes:
 
 def palette() -> NDArray[np.uint8]:
     """Return the colours (249, 3): background, each class from dark to bright, not annotated."""
-    colours = [MATERIAL_COLOURS[index] for index in (*range(CLASSES), UNANNOTATED)]
-    rgb = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in colours])
+    rgb = COLOURS[[*range(CLASSES), UNANNOTATED]]
     shades = np.linspace(_DARKEST, _BRIGHTEST, SHADES)
     shaded = np.minimum(rgb[:, None, :] * shades[None, :, None], 255)
     return np.concatenate([np.zeros((1, 3)), shaded.reshape(-1, 3)]).round().astype(np.uint8)

@@ -1,11 +1,12 @@
 """A store with hostile strings, and its page."""
 
-import json
 import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-import zarr
+from support.made_store import edit_json, edit_record, rewrite
 from support.pages import HOSTILE, Page, Report
 
 from slatprep.inspect.report import write_report
@@ -19,22 +20,16 @@ def hostile(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory)
     folder = tmp_path_factory.mktemp("report")
     store = Path(shutil.copytree(mixed_build.store, folder / "mixed.zarr"))
     manifests = Path(shutil.copytree(mixed_build.records.parent, folder / "mixed.manifests"))
-    group = zarr.open_group(store, mode="r+")
-    categories = group["asset/category"][:]
-    categories[:] = ["animal", "animal", "animal", HOSTILE, "vessel"]
-    group["asset/category"][:] = categories
-    texts = group["asset/record"][:]
-    for row, text in enumerate(texts):
-        record = json.loads(str(text))
-        if record["asset_id"] == "ant":
-            record["judgement"]["reasons"] = [HOSTILE]
-            texts[row] = json.dumps(record)
-    group["asset/record"][:] = texts
-    build = json.loads((manifests / "build.json").read_text("utf-8"))
-    for record in build["failed"]:
-        if record["status"] == "failed":
-            record["reason"] = HOSTILE
-    (manifests / "build.json").write_text(json.dumps(build), "utf-8")
+    categories = np.array(["animal", "animal", "animal", HOSTILE, "vessel"], dtype=object)
+    rewrite(store, "asset/category", slice(None), categories)
+    edit_record(store, 0, lambda record: record["judgement"].update(reasons=[HOSTILE]))
+
+    def give_reasons(build: dict[str, Any]) -> None:
+        for record in build["failed"]:
+            if record["status"] == "failed":
+                record["reason"] = HOSTILE
+
+    edit_json(manifests / "build.json", give_reasons)
     path = folder / "page.html"
     write_report(open_store(store), path, manifests=manifests)
     return Report(store, manifests, path)

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import zarr
 from PIL import Image
+from support.made_store import edit_record
 from support.pages import HOSTILE, Page, Report
 from support.synthetic import Dataset, MakeDataset
 
@@ -268,17 +268,10 @@ def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
 
 def test_tied_placements_are_stepped_through(browser, mixed_build, tmp_path):
     store = Path(shutil.copytree(mixed_build.store, tmp_path / "mixed.zarr"))
-    texts = (group := zarr.open_group(store, mode="r+"))["asset/record"][:]
-    turned = np.eye(4)
-    turned[:2, :2] = [[-1, 0], [0, -1]]
-    for row, text in enumerate(texts):
-        record = json.loads(str(text))
-        if record["asset_id"] == "cup":
-            record["alignment"]["placements"] = [
-                {"transform": turned.tolist(), "score": 1.0, "displacement": 40.0}
-            ]
-            texts[row] = json.dumps(record)
-    group["asset/record"][:] = texts
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0]).tolist()
+    placements = [{"transform": turned, "score": 1.0, "displacement": 40.0}]
+    row = open_store(store).ids.index("cup")
+    edit_record(store, row, lambda record: record["alignment"].update(placements=placements))
     path = tmp_path / "page.html"
     write_report(open_store(store), path, manifests=mixed_build.records.parent)
     browser.get("about:blank")

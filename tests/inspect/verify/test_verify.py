@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from support.commands import document, refused, run
 from support.faults import flip
-from support.made_store import edit_json, rewrite
+from support.made_store import edit_json, edit_record, rewrite
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import Finding, SourceRoots, index_findings, verify_store
@@ -177,12 +176,6 @@ def test_a_voxel_that_is_not_valid_but_labelled_is_found(store):
     rewrite(store, "voxel/valid", 4, False)
     files = {finding.file for finding in found(store) if finding.asset == "ant"}
     assert {"voxel/material", "voxel/properties"} <= files
-
-
-def edit_record(store: Path, row: int, edit: Callable[[dict], object]) -> None:
-    record = json.loads(str(open_store(store).read_rows("asset/record", row, row + 1)[0]))
-    edit(record)
-    rewrite(store, "asset/record", row, json.dumps(record))
 
 
 def test_another_confidence_of_a_voxel_is_found_and_told_of_as_of_other_code(store):

@@ -1,19 +1,22 @@
-"""npz exports are read as TRELLIS's data set and VoMP's scripts read them."""
+"""Files of an asset are read as their users read them: TRELLIS's data set, VoMP, Pixie, Open3D."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pandas
+import plyfile
 import pytest
 from support.commands import refused, run
 from support.exports import hold_truth, index_of
-from support.made_store import rewrite
+from support.made_store import edit_record, rewrite
 from support.raw_sources import field_at
-from support.synthetic import JELLY, METAL
+from support.synthetic import JELLY, METAL, QUARTER_TURN, MakeDataset
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, StoreError
 from slatprep.export import ExportOptions, export_store
+from slatprep.export.ply import VERTEX
+from slatprep.pipeline.dataset import build_store
 from slatprep.records import MATERIAL_CLASSES
 
 ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"  # latent_model of TRELLIS's configurations
@@ -161,3 +164,102 @@ def test_points_may_be_chosen_for_voxel_data_and_the_frame_may_not(store, tmp_pa
     assert "--frame is for --format ply, not voxel_data" in refused("export", *words)
     options = ExportOptions(points="slat")
     export_store(store, tmp_path / "o", "voxel_data", assets=["cup"], options=options)
+
+
+# -- PLY -------------------------------------------------------------------------
+
+
+# As `map_pred_to_coords.py` of Pixie declares the rows of its files.
+PIXIE_VERTEX = [
+    ("x", "f4"), ("y", "f4"), ("z", "f4"),
+    ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1"),
+    ("part_label", "i4"), ("density", "f4"), ("E", "f4"), ("nu", "f4"),
+    ("material_id", "i4"),
+    ("conf", "f4"),
+]  # fmt: skip
+
+
+def positions_of(vertex: plyfile.PlyElement) -> np.ndarray:
+    return np.column_stack([vertex[axis] for axis in "xyz"])
+
+
+def test_ply_is_read_by_plyfile_and_open3d_as_pixie_writes_it(store, mixed, tmp_path):
+    import open3d
+
+    export_store(store, tmp_path / "ply", "ply")
+    assert np.dtype(PIXIE_VERTEX).newbyteorder("<") == VERTEX
+    for entry in index_of(tmp_path / "ply"):
+        asset = mixed.assets[entry["asset_id"]]
+        vertex = plyfile.PlyData.read(tmp_path / "ply" / entry["file"])["vertex"]
+        assert vertex.data.dtype == np.dtype(PIXIE_VERTEX)
+        assert len(vertex.data) == entry["points"] == len(asset.coords)
+        # TRELLIS's frame: voxel i is centred at (i + 0.5)/64 - 0.5.
+        positions = positions_of(vertex)
+        np.testing.assert_allclose((positions + 0.5) * 64 - 0.5, asset.coords, atol=1e-5)
+        assert (vertex["part_label"] == vertex["material_id"]).all()
+        hold_truth(*(vertex[name] for name in ("material_id", "E", "density", "nu")))
+        # These assets are placed exactly, so every annotation is the voxel's own.
+        np.testing.assert_allclose(vertex["conf"], 1.0, atol=1e-3)
+    cloud = open3d.t.io.read_point_cloud(str(tmp_path / "ply" / entry["file"]))
+    assert np.array_equal(cloud.point.positions.numpy(), positions.astype(np.float32))
+    assert np.array_equal(cloud.point["E"].numpy()[:, 0], vertex["E"])
+
+
+def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path):
+    grid = mixed.assets["cup"].grid
+    voxels = np.argwhere(grid[..., 3] != 7)
+    for frame in ("slat", "pixieverse"):
+        options = ExportOptions(points="grid", frame=frame)
+        export_store(store, tmp_path / frame, "ply", assets=["cup"], options=options)
+    world, slat = (
+        plyfile.PlyData.read(tmp_path / frame / "cup.ply")["vertex"]
+        for frame in ("pixieverse", "slat")
+    )
+    # Where Pixie's `map_pred_to_coords.py` puts voxels of a field without bounds of its own.
+    expected = np.linspace(-0.5, 0.5, 64)[voxels]
+    turned = ((voxels + 0.5) / 64 - 0.5) @ QUARTER_TURN[:3, :3].T
+    for vertex, places, off in ((world, expected, 1e-6), (slat, turned, 2e-3)):
+        np.testing.assert_allclose(positions_of(vertex), places, atol=off)
+    truth = grid[tuple(voxels.T)]
+    for vertex in (world, slat):
+        np.testing.assert_array_equal(vertex["material_id"], truth[:, 3])
+        np.testing.assert_allclose(vertex["density"], truth[:, 0], rtol=1e-4)
+
+
+def test_world_bounds_of_the_records_are_used(make_dataset: MakeDataset, tmp_path):
+    dataset = make_dataset("cup")
+    lo, hi = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 7.0])
+    np.savez(
+        tmp_path / "sources" / "pixieverse" / "cup" / "clip_features.npz",
+        min_bounds=lo, max_bounds=hi, grid_shape=(64, 64, 64),
+    )  # fmt: skip
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    options = ExportOptions(points="grid", frame="pixieverse")
+    done = export_store(summary.store, tmp_path / "ply", "ply", options=options)
+    assert done.notes == ()
+    vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
+    voxels = np.argwhere(dataset.assets["cup"].grid[..., 3] != 7)
+    expected = np.take_along_axis(np.linspace(lo, hi, 64), voxels, axis=0)
+    np.testing.assert_allclose(positions_of(vertex), expected, atol=1e-5)
+
+
+def test_a_field_without_bounds_is_told(store, tmp_path):
+    done = export_store(store, tmp_path / "ply", "ply", options=ExportOptions(frame="pixieverse"))
+    assert "5 assets have no world bounds" in done.notes[0]
+    assert json.loads((tmp_path / "ply" / "index.json").read_text())["notes"] == list(done.notes)
+
+
+def test_bounds_that_make_no_sense_are_refused(copy, tmp_path):
+    said = r"expected min_bounds and max_bounds of three numbers|bounds: Input should be"
+    for bounds in (
+        {"min_bounds": [0, 0, 0]},
+        {"min_bounds": [0, 0, 0], "max_bounds": [1, 1, 0]},
+        {"min_bounds": [0, 0], "max_bounds": [1, 1]},
+        {"min_bounds": "low", "max_bounds": "high"},
+        [1, 2],
+    ):
+        edit_record(copy, 0, lambda record, bounds=bounds: record.update(bounds=bounds))
+        options = ExportOptions(frame="pixieverse")
+        with pytest.raises(StoreError, match=said):
+            export_store(copy, tmp_path / "ply", "ply", options=options)
+        assert not (tmp_path / "ply").exists()
