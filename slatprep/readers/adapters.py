@@ -57,7 +57,8 @@ class SourceAdapter(Protocol):
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Yield its fields; where only names matter, as here, `find_by_pattern` is enough."""
-        return find_by_pattern(patterns_of(self, source), listing, {})
+        chosen = {"sample": source.sample} if source.sample else {}
+        return find_by_pattern(patterns_of(self, source), listing, chosen)
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read the field at ``pair.grid`` in SI units; raise `InputError` if that fails."""

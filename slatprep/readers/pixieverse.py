@@ -7,7 +7,6 @@ slatprep orders them as `PROPERTY_COLUMNS` does, Young's modulus first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from slatprep.errors import InputError
 from slatprep.geometry.voxels import voxels_at
 from slatprep.parameters import PixieverseSource, SampleParameters
 from slatprep.readers import files
-from slatprep.readers.adapters import FoundField, Holding, find_by_pattern
+from slatprep.readers.adapters import Holding, SourceAdapter
 from slatprep.readers.values import require_plausible, require_possible, require_prediction
 from slatprep.readers.voxel_sets import physical, physical_rows
 from slatprep.records import (
@@ -33,7 +32,6 @@ from slatprep.records import (
     Place,
     SourceFile,
 )
-from slatprep.storage.files import Listing
 
 _CUBE = (RESOLUTION,) * 3
 _RAW_SHAPE = (*_CUBE, 4)
@@ -52,7 +50,7 @@ _NO_LOG_OF_ZERO = 1e-6
 _CHANNEL_ORDER = (1, 0, 2)
 
 
-class PixieVerse:
+class PixieVerse(SourceAdapter):
     """PixieVerse's grids and Pixie's predictions; patterns and samples as `discover` has them."""
 
     patterns = PixieverseSource.grid
@@ -60,11 +58,6 @@ class PixieVerse:
     def describe(self, source: PixieverseSource) -> Holding:
         """Say that there are three properties and PhysGaussian's classes."""
         return Holding()
-
-    def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
-        """Find the grids by the names of their files."""
-        chosen = {"sample": source.sample} if source.sample else {}
-        return find_by_pattern(source.grid, listing, chosen)
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a grid or a prediction; see `read_grid`."""

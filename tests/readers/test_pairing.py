@@ -77,6 +77,12 @@ def test_several_samples_need_a_choice(find):
         find(pixieverse={"samples": "merge", "sample": "1"})
 
 
+def test_the_sample_is_chosen_whatever_the_adapter(find, tmp_path):
+    own = {"adapter": "vomp", "grid": ("{id}/{sample}.npz",), "sample": "2"}
+    (pair,) = find(["a/1.npz", "a/2.npz"], ["a.npz"], pixieverse=own)
+    assert (pair.grid, pair.problem) == (tmp_path / "pixie/a/2.npz", "")
+
+
 def test_several_samples_by_number(find):
     numbers = (10, 0, 2)
     touched = [f"a/sample_{k}_{what}.npy" for k in numbers for what in ("pred", "mask")]
