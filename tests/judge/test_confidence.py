@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.special import logit
-from support.shapes import GRID, chair, field_of, surface_latents
+from support.shapes import GRID, Case, chair, field_of, surface_latents
 
 from slatprep.align import align
 from slatprep.align.figures import measure_figures
 from slatprep.demo import make_demo
 from slatprep.geometry.deformation import map_of
-from slatprep.inspect.score import Truth, read_truth
+from slatprep.inspect.score import read_truth
 from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, judge, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
@@ -174,7 +174,6 @@ def test_a_dataset_that_the_shipped_model_finds_rough_is_set_right_by_its_decoys
     assert found.wrong_share < 0.05
 
 
-Case = tuple[MaterialField, StructuredLatents, Truth]
 Judged = tuple[Judgement, np.ndarray, Annotation]
 OfAChair = tuple[MaterialField, StructuredLatents, Alignment, Annotation]
 

@@ -87,12 +87,6 @@ def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(
     assert len(reasons) == (0 if good else 1)
 
 
-def test_one_tie_is_named_as_one() -> None:
-    verdict, (reason,) = verdict_of(FINE, 1.0, 0.06, 1)
-    assert verdict is Verdict.DOUBTFUL
-    assert reason.startswith("another placement fits about")
-
-
 def test_without_a_cause_none_is_named_and_the_fitness_is() -> None:
     _, (first, *fitnesses) = verdict_of(ROUGH, 1.0, same_object=0.6, right_placement=1.0)
     assert first.endswith("together)")

@@ -135,15 +135,6 @@ def test_a_pipe_is_not_waited_for(name, tmp_path):
     refused(tmp_path / name, "no regular file")
 
 
-def test_npy_and_npz_hold_the_same_particles(tmp_path):
-    np.save(tmp_path / "a.npy", POSITIONS)
-    np.savez(tmp_path / "b.npz", xyz=POSITIONS, weight=np.ones(4))
-    for name in ("a.npy", "b.npz"):
-        read = read_particles(tmp_path / name)
-        np.testing.assert_array_equal(read.positions, POSITIONS.astype(np.float64))
-        assert (read.axes, read.foreign) == ("slat", "")
-
-
 def test_an_archive_that_claims_more_particles_than_there_can_be_is_refused(tmp_path):
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(

@@ -260,7 +260,8 @@ def test_prediction_is_transferred_as_the_store_is(store, tmp_path):
     export_store(store, tmp_path / "npz", "npz", assets=["cup"])
     (prediction,) = (tmp_path / "npz").glob("latents/*/cup.npz")
     with np.load(prediction) as held:
-        np.savez(tmp_path / "points.npz", positions=particles_near(held["coords"], 100, 0.5))
+        positions = particles_near(held["coords"], 100, 0.5)
+    np.savez(tmp_path / "points.npz", positions=positions, weight=np.ones(4))
     for name, words in (
         ("stored", ("--store", store, "--asset", "cup")),
         ("predicted", ("--store", store, "--prediction", prediction)),

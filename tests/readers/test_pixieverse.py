@@ -143,17 +143,7 @@ def test_soft_mask_is_cut_at_one_half(make_pair):
     assert field.warnings[0].startswith("mask: 2 voxels lie between 0 and 1")
 
 
-def test_sources_are_named_and_hashed(make_pair):
-    pair = make_pair(mask=mask_of(raw_grid()), bounds={"voxel_size": 1 / 64})
-    sources = {source.role: source for source in read_field(pair).sources}
-    assert list(sources) == ["grid", "mask", "bounds"]
-    for role, path in (("grid", pair.grid), ("mask", pair.mask), ("bounds", pair.bounds)):
-        data, source = path.read_bytes(), sources[role]
-        assert source.sha256 == hashlib.sha256(data).hexdigest()
-        assert (source.size, source.path) == (len(data), f"a/{path.name}")
-
-
-def test_bounds_are_json_ready(make_pair):
+def test_sources_are_named_and_hashed_and_bounds_are_ready_for_json(make_pair):
     bounds = {
         "min_bounds": [-0.5, -0.5, -0.25],
         "voxel_size": 0.015625,
@@ -161,7 +151,15 @@ def test_bounds_are_json_ready(make_pair):
         "alpha_weighted": True,
         "model": "ViT-L",
     }
-    assert json.loads(json.dumps(read_field(make_pair(bounds=bounds)).bounds)) == bounds
+    pair = make_pair(mask=mask_of(raw_grid()), bounds=bounds)
+    field = read_field(pair)
+    assert json.loads(json.dumps(field.bounds)) == bounds
+    sources = {source.role: source for source in field.sources}
+    assert list(sources) == ["grid", "mask", "bounds"]
+    for role, path in (("grid", pair.grid), ("mask", pair.mask), ("bounds", pair.bounds)):
+        data, source = path.read_bytes(), sources[role]
+        assert source.sha256 == hashlib.sha256(data).hexdigest()
+        assert (source.size, source.path) == (len(data), f"a/{path.name}")
 
 
 def test_unreadable_bounds_are_a_warning(make_pair):
