@@ -1,10 +1,11 @@
-"""Objects on a slab of ground that the SLAT does not have, under maps known by construction."""
+"""What a SLAT does not show: a slab of ground, and that its annotation is mirrored."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
+from numpy.typing import NDArray
+from scipy.ndimage import affine_transform, map_coordinates
 from scipy.spatial.transform import Rotation
 from support.shapes import GRID, chair, field_of, judged, surface_latents
 
@@ -15,9 +16,9 @@ from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
 from slatprep.geometry.frames import displacement, make_transform
-from slatprep.geometry.voxels import above
+from slatprep.judge import THRESHOLDS
 from slatprep.parameters import AlignParameters
-from slatprep.records import Ground, LatentChoice, Placement, Verdict
+from slatprep.records import LatentChoice, Placement, Verdict
 
 DEFAULT = AlignParameters()
 HEIGHTS = GRID[..., 2].astype(float)
@@ -136,18 +137,6 @@ def test_quality_does_not_count_the_ground():
     assert measure_quality(field, latents, found.transform, 1.0).fitness < 0.5
 
 
-def test_a_hollow_object_stays_closed_without_its_ground():
-    bell = np.zeros((64, 64, 64), dtype=bool)
-    bell[20:40, 20:40, 20:44] = True
-    solid = bell.copy()
-    bell[23:37, 23:37, 20:41] = False
-    ground = Ground(np.array([0.0, 0.0, 1.0]), (FOOT - 0.5 - 31.5) / 64)
-    # It goes on for the layer whose centres are less than a voxel and a half below the top.
-    solid[20:40, 20:40, 19] = True
-    np.testing.assert_array_equal(above(bell | slab(3.0), ground), solid)
-    np.testing.assert_array_equal(above(bell, None), bell)
-
-
 def test_a_placement_that_is_taken_is_fitted_without_the_ground():
     field, latents = field_of(chair() | slab(3.0)), surface_latents(larger(chair(), 1.2))
     found = align(field, latents, DEFAULT)
@@ -161,3 +150,78 @@ def test_a_placement_that_is_taken_is_fitted_without_the_ground():
     assert settled.ground is found.ground
     assert displacement(settled.transform, found.transform, latents.centres) < 0.2
     assert settled.quality.fitness == pytest.approx(found.quality.fitness, abs=0.01)
+
+
+LIMIT = THRESHOLDS.good_mirrored
+
+
+def gain(solid: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+    found = align(field_of(solid), surface_latents(other), DEFAULT)
+    return found.figures.mirrored
+
+
+def turned(solid: NDArray[np.bool_], seed: int) -> NDArray[np.bool_]:
+    """Return a solid in any rotation about the cube's centre."""
+    turn = Rotation.random(random_state=seed).as_matrix()
+    middle = np.full(3, 31.5)
+    at = affine_transform(solid.astype(float), turn, middle - turn @ middle, order=1)
+    return at > 0.5
+
+
+def bitten(solid: NDArray[np.bool_], at: tuple[int, int, int]) -> NDArray[np.bool_]:
+    return solid & (((GRID - np.array(at)) ** 2).sum(axis=-1) > 40)
+
+
+def table() -> NDArray[np.bool_]:
+    """A solid that is its own mirror image in x, and in nothing else."""
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[10:54, 16:46, 40:46] = True
+    solid[14:20, 20:26, 16:40] = solid[44:50, 20:26, 16:40] = True
+    solid[28:36, 40:44, 16:40] = True
+    return solid
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_surface_of_a_mirrored_set_is_the_mirrored_surface(axis):
+    solid = np.moveaxis(chair(), axis, 0)
+    here, there = surface_of(solid).mirrored(), surface_of(solid[::-1])
+    np.testing.assert_array_equal(here.distance, there.distance)
+    np.testing.assert_allclose(here.origin, there.origin)
+    for ours, theirs in ((here.points, there.points), (here.boundary, there.boundary)):
+        assert {tuple(row) for row in ours.tolist()} == {tuple(row) for row in theirs.tolist()}
+
+
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_a_mirrored_annotation_is_told_in_any_rotation(seed):
+    solid, mirrored = bitten(chair(), (30, 24, 28)), chair()[::-1]
+    other = mirrored if seed is None else turned(mirrored, seed)
+    assert gain(solid, other) > 2 * LIMIT
+
+
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_an_annotation_that_is_not_mirrored_is_not_told_to_be(seed):
+    solid, other = bitten(chair(), (30, 24, 28)), chair()
+    found = gain(solid, other if seed is None else turned(other, seed))
+    assert not found > 0.0
+
+
+def test_an_object_that_is_its_own_mirror_image_is_not_told_to_be_mirrored():
+    """Bites on both sides, so that neither fits so well that no mirror is tried."""
+    for at in ((14, 20, 43), (50, 40, 43)):
+        found = gain(bitten(table(), at), table()[:, :, ::-1])
+        assert abs(found) < LIMIT
+
+
+def test_what_fits_too_well_is_not_tried():
+    assert np.isnan(gain(chair(), chair()))
+
+
+def test_a_mirrored_annotation_is_not_good_and_is_told_as_what_it_is():
+    """Nearly all of the labels are right: the solid is a mirror image but for a small fin."""
+    solid = table()
+    solid[44:50, 26:32, 16:40] = True
+    field, latents = field_of(solid), surface_latents(solid[::-1])
+    found = align(field, latents, DEFAULT)
+    judgement = judged(field, latents, found)
+    assert judgement.verdict is not Verdict.GOOD
+    assert any("mirror image of its object" in reason for reason in judgement.reasons)

@@ -1,4 +1,4 @@
-"""What is fitted at a placement that a pass over the dataset takes."""
+"""What a pass over a dataset settles: which placement is taken, and what is fitted there."""
 
 from dataclasses import replace
 
@@ -6,16 +6,34 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.deformed import MOVES, occupancy
-from support.shapes import chair, field_of, surface_latents
+from support.shapes import chair, field_of, surface_latents, turned
 
 from slatprep.align import align
+from slatprep.align.consensus import (
+    SURE,
+    TEMPERATURE,
+    degrees_between,
+    find_consensus,
+    probability_of_common,
+    settle,
+    turn_if_likelier,
+)
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
+from slatprep.align.starts import distinct_starts
 from slatprep.geometry.deformation import map_of
-from slatprep.geometry.frames import VOXEL_SIZE, apply_transform, make_transform, voxel_centres
+from slatprep.geometry.frames import (
+    VOXEL_SIZE,
+    apply_transform,
+    displacement,
+    make_transform,
+    split_transform,
+    voxel_centres,
+)
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
+    Consensus,
     LatentChoice,
     MaterialField,
     Model,
@@ -23,67 +41,188 @@ from slatprep.records import (
     StructuredLatents,
 )
 
+COMMON = distinct_starts()[14].rotation
+
+
+def _tilted(rotation: np.ndarray, seed: int) -> np.ndarray:
+    tilt = Rotation.from_rotvec(np.random.default_rng(seed).normal(scale=0.05, size=3))
+    return make_transform(tilt.as_matrix() @ rotation, [0.01, 0.0, 0.02])
+
+
+def test_the_common_rotation_is_found_among_others():
+    transforms = [_tilted(COMMON, seed) for seed in range(12)]
+    transforms += [_tilted(start.rotation, 50) for start in distinct_starts()[:8]]
+    consensus = find_consensus(transforms)
+    assert (consensus.winners, consensus.agreeing) == (20, 12)
+    assert degrees_between(consensus.rotation, COMMON) < 3.0
+    assert np.linalg.det(consensus.rotation) == pytest.approx(1.0)
+    shuffled = [transforms[i] for i in np.random.default_rng(0).permutation(20)]
+    again = find_consensus(shuffled)
+    assert again.rotation.tobytes() == consensus.rotation.tobytes()
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        [],
+        [_tilted(COMMON, seed) for seed in range(4)],  # too few
+        [_tilted(start.rotation, 1) for start in distinct_starts()],  # all different
+    ],
+)
+def test_no_rotation_is_common_where_few_agree(transforms):
+    assert find_consensus(transforms) is None
+
+
+def test_just_enough_is_enough():
+    """Five at least, and half of all at least; within 30 degrees of a quarter turn."""
+    others = [make_transform(start.rotation) for start in distinct_starts()]
+    others = [one for one in others if degrees_between(one[:3, :3], COMMON) > 1]
+    five = [make_transform(COMMON)] * 5
+    assert find_consensus(five[:4]) is None
+    found = find_consensus(five + others[:5])
+    assert (found.winners, found.agreeing) == (10, 5)
+    assert find_consensus(five + others[:6]) is None
+    for degrees, agreeing in ((29.9, 6), (30.1, 5)):
+        turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        found = find_consensus([*five, make_transform(turn @ COMMON)])
+        assert found.agreeing == agreeing
+
+
+def test_no_turn_and_half_a_turn_are_angles_too():
+    # The trace of such a product may be rounded beyond 3, and beyond -1.
+    for rotation in Rotation.random(200, random_state=1):
+        turn = rotation.as_matrix()
+        axis = rotation.apply([0.0, 0.0, 1.0])
+        back = Rotation.from_rotvec(np.pi * axis).as_matrix() @ turn
+        some = Rotation.from_rotvec(np.radians(33) * axis).as_matrix() @ turn
+        assert degrees_between(turn, some) == pytest.approx(33)
+        assert degrees_between(turn, turn) == pytest.approx(0.0, abs=1e-5)
+        assert degrees_between(turn, back) == pytest.approx(180.0, abs=1e-5)
+
+
+def _agreeing(count: int, others: int = 0) -> Consensus:
+    away = [s.rotation for s in distinct_starts() if degrees_between(s.rotation, COMMON) > 1]
+    return find_consensus([make_transform(turn) for turn in [COMMON] * count + away[:others]])
+
+
+@pytest.fixture(scope="module")
+def boxed() -> tuple[MaterialField, StructuredLatents, Alignment]:
+    """A box, which four placements fit, turned by the common rotation."""
+    box = np.zeros((64, 64, 64), dtype=bool)
+    box[12:52, 22:42, 27:37] = True
+    field, latents = field_of(box), surface_latents(turned(box, COMMON))
+    return field, latents, align(field, latents, AlignParameters())
+
+
+def test_a_tie_goes_to_the_common_rotation_and_can_be_undone(boxed):
+    _, latents, before = boxed
+    after = settle(before, latents, _agreeing(6))
+    assert displacement(after.transform, make_transform(COMMON), latents.centres) < 0.05
+    choices = [before.transform, *(p.transform for p in before.placements)]
+    others = [after.transform, *(p.transform for p in after.placements)]
+    assert {c.tobytes() for c in choices} == {c.tobytes() for c in others}
+    assert isinstance(after.settled_by, Consensus)
+    assert 0.95 < after.settled_by.probability < 1.0, "six agree, of four that fit as well"
+    if after.transform is not before.transform:
+        np.testing.assert_array_equal(after.placements[0].transform, before.transform)
+
+
+def test_whichever_placement_came_first_the_same_one_is_chosen(boxed):
+    _, latents, found = boxed
+    assert len(found.placements) == 3
+    chosen = set()
+    transforms = [found.transform, *(p.transform for p in found.placements)]
+    for first in range(4):
+        order = [transforms[first], *transforms[:first], *transforms[first + 1 :]]
+        other = replace(
+            found,
+            transform=order[0],
+            placements=tuple(
+                replace(p, transform=t) for p, t in zip(found.placements, order[1:], strict=True)
+            ),
+        )
+        chosen.add(settle(other, latents, _agreeing(6)).transform.tobytes())
+    assert len(chosen) == 1
+
+
+@pytest.mark.parametrize("gain", [-0.1, -0.02, 0.0, 0.03])
+@pytest.mark.parametrize(("agree", "others"), [(5, 5), (19, 1), (400, 0)])
+def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(agree, others, gain):
+    """By Bayes' rule, counted over a dataset of the common rotation and of 23 other ones."""
+    seen = agree + others + 1
+    prior = np.array([agree / seen] + [(others + 1) / seen / 23] * 23)
+    likelihood = np.exp(np.array([gain, 0.0]) / TEMPERATURE)
+    joint = prior[:2] * likelihood
+    expected = joint[0] / joint.sum()
+    assert probability_of_common(_agreeing(agree, others), gain) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("turn", "agreeing"), [(distinct_starts()[3].rotation, 500), (COMMON, 5)], ids=["other", "same"]
+)
+def test_an_asset_that_is_clearly_turned_so_stays(turn, agreeing):
+    """However many assets agree: the shapes say more than that."""
+    assert (degrees_between(turn, COMMON) > 60) == (agreeing == 500)
+    field, latents = field_of(chair()), surface_latents(turned(chair(), turn))
+    found = align(field, latents, AlignParameters())
+    assert turn_if_likelier(found, field, latents, _agreeing(agreeing), AlignParameters()) is found
+
+
+def test_an_asset_that_fits_as_well_is_turned_as_the_dataset_is(boxed):
+    """Of its four placements only a wrong one was found."""
+    field, latents, found = boxed
+    choices = [found.transform, *(p.transform for p in found.placements)]
+    wrong = next(c for c in choices if degrees_between(split_transform(c)[0], COMMON) > 60)
+    alone = replace(found, transform=wrong, placements=())
+    after = turn_if_likelier(alone, field, latents, _agreeing(19, 1), AlignParameters())
+    assert displacement(after.transform, make_transform(COMMON), latents.centres) < 0.1
+    assert isinstance(after.settled_by, Consensus)
+    assert after.settled_by.probability > SURE
+    assert after.placements[0].transform.tobytes() == wrong.tobytes()
+
+
 BY = LatentChoice(0.99, 12.0, 300, 40, 40)
 ELSEWHERE = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
 
 
-def with_another_first(
-    field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
-) -> tuple[Alignment, Alignment]:
-    """Align; return that, and it as if another placement had been taken for the best."""
+@pytest.mark.parametrize(
+    ("name", "asked", "model"),
+    [
+        ("bent", "auto", Model.DEFORMABLE),
+        ("long", "auto", Model.AFFINE),
+        ("same", "auto", Model.RIGID),
+        ("bent", "rigid", Model.RIGID),
+        ("bent", "similarity", Model.SIMILARITY),
+    ],
+)
+def test_what_is_taken_is_fitted_as_aligning_would_fit_it(name, asked, model):
+    move = MOVES.get(name, np.copy)
+    field, latents = field_of(occupancy(np.copy)), surface_latents(occupancy(move))
+    parameters = AlignParameters(model=asked)
     found = align(field, latents, parameters)
-    other = replace(
-        found,
-        transform=ELSEWHERE,
-        deformation=None,
-        figures=None,
-        model=Model.RIGID,
-        placements=(Placement(found.transform, found.score, 20.0),),
-    )
-    return found, other
-
-
-@pytest.mark.parametrize(("name", "model"), [("bent", Model.DEFORMABLE), ("long", Model.AFFINE)])
-def test_a_placement_that_is_taken_is_deformed_as_aligning_would_deform_it(name, model):
-    field = field_of(occupancy(lambda points: points))
-    latents = surface_latents(occupancy(MOVES[name]))
-    parameters = AlignParameters()
-    found, other = with_another_first(field, latents, parameters)
     assert found.model is model
+    # As if another placement had been taken for the best.
+    right = Placement(found.transform, found.score, 20.0)
+    other = replace(
+        found, transform=ELSEWHERE, deformation=None, figures=None, model=Model.RIGID,
+        placements=(right,),
+    )  # fmt: skip
     taken = take(other, 0, latents, BY)
     assert taken.deformation is None
     np.testing.assert_array_equal(taken.placements[0].transform, ELSEWHERE)
+    assert taken.placements[0].displacement > 5
     settled = refit(taken, field, latents, parameters)
-    assert settled.model is model
-    assert settled.settled_by == BY
-    places = map_of(settled).places(latents.coords)
-    off = np.linalg.norm(places - MOVES[name](voxel_centres(latents.coords)), axis=1) / VOXEL_SIZE
-    assert np.median(off) < 0.7
-    # The search leaves the best placement slightly off where a new fit ends.
-    apart = np.linalg.norm(places - map_of(found).places(latents.coords), axis=1) / VOXEL_SIZE
-    assert apart.max() < 0.2
-    assert settled.figures.score_slat == pytest.approx(found.figures.score_slat, abs=0.01)
+    assert (settled.model, settled.settled_by) == (model, BY)
+    assert (settled.deformation is None) == (model in (Model.RIGID, Model.SIMILARITY))
     assert settled.quality == measure_quality(field, latents, settled.transform, parameters.radius)
-
-
-def test_where_shapes_are_the_same_nothing_is_deformed():
-    field, latents = field_of(chair()), surface_latents(chair())
-    found, other = with_another_first(field, latents, AlignParameters())
-    settled = refit(take(other, 0, latents, BY), field, latents, AlignParameters())
-    assert (settled.model, settled.deformation) == (Model.RIGID, None)
-    np.testing.assert_allclose(settled.transform, found.transform, atol=1e-3)
-    assert settled.placements[0].displacement > 5
-
-
-@pytest.mark.parametrize("model", ["rigid", "similarity"])
-def test_what_the_parameters_forbid_is_not_fitted(model):
-    field = field_of(occupancy(lambda points: points))
-    latents = surface_latents(occupancy(MOVES["bent"]))
-    parameters = AlignParameters(model=model)
-    _, other = with_another_first(field, latents, parameters)
-    settled = refit(take(other, 0, latents, BY), field, latents, parameters)
-    assert settled.model == model
-    assert settled.deformation is None
+    if asked == "auto":
+        places = map_of(settled).places(latents.coords)
+        off = np.linalg.norm(places - move(voxel_centres(latents.coords)), axis=1) / VOXEL_SIZE
+        assert np.median(off) < 0.7
+        # The search leaves the best placement slightly off where a new fit ends.
+        apart = np.linalg.norm(places - map_of(found).places(latents.coords), axis=1) / VOXEL_SIZE
+        assert apart.max() < 0.2
+        assert settled.figures.score_slat == pytest.approx(found.figures.score_slat, abs=0.01)
 
 
 def test_taking_a_placement_leaves_the_others_and_the_model_of_a_rigid_fit():

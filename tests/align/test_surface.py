@@ -1,11 +1,17 @@
-"""Filled sets, their distance fields and samples."""
+"""What a search starts from, surfaces and orientations, and the figures of what it found."""
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes
-from support.shapes import GRID, chair
+import pytest
+from scipy.spatial.transform import Rotation
+from support.shapes import GRID, chair, field_of, surface_latents
 
+from slatprep.align.quality import compare, measure_quality
+from slatprep.align.starts import candidates_of, distinct_starts, euler_starts, so3_starts
 from slatprep.align.surface import BAND, CENTRE, DILATION, surface_of
+from slatprep.geometry.frames import make_transform
 from slatprep.geometry.voxels import boundary, filled, voxels_of
+from slatprep.judge import THRESHOLDS, verdict_of
+from slatprep.records import Quality, Verdict
 
 
 def test_a_shell_and_its_solid_have_the_same_surface():
@@ -15,19 +21,6 @@ def test_a_shell_and_its_solid_have_the_same_surface():
     np.testing.assert_array_equal(here.distance, there.distance)
     np.testing.assert_array_equal(here.points, there.points)
     np.testing.assert_array_equal(here.boundary, there.boundary)
-
-
-def test_filling_agrees_with_scipy_and_leaves_open_vessels_open():
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        noise = rng.random((64, 64, 64)) < 0.6
-        np.testing.assert_array_equal(filled(noise), binary_fill_holes(noise))
-    box = np.zeros((64, 64, 64), dtype=bool)
-    box[10:30, 10:30, 10:30] = True
-    box[12:28, 12:28, 12:28] = False
-    assert filled(box).sum() == 20**3
-    box[20, 20, 28:30] = False  # a hole through the lid
-    np.testing.assert_array_equal(filled(box), box)
 
 
 def test_the_distance_is_that_to_the_faces_less_the_dilation():
@@ -50,23 +43,24 @@ def test_the_distance_is_euclidean():
     np.testing.assert_allclose(surface.distance.ravel(), expected, atol=1e-5)
 
 
-def test_samples_lie_near_the_faces_on_both_sides():
-    ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 20**2
-    surface = surface_of(ball)
-    radius = np.linalg.norm(surface.points, axis=1)
-    assert abs(radius.mean() - 20) < 0.1
-    assert (radius < 20).any() and (radius > 20).any()
-    assert np.abs(radius - 20).max() < 2.5
-    assert abs(surface.size - 20) < 0.2
-
-
-def test_a_subset_is_even_and_repeatable():
+def test_a_subset_is_even_and_repeatable_and_has_no_sample_twice():
     surface = surface_of(chair())
-    some = surface.subset(300)
+    total = len(surface.points)
+    some, other = surface.subset(300), surface.subset(300, 300)
     assert 250 <= len(some.points) <= 300
     np.testing.assert_array_equal(some.points, surface.subset(300).points)
     assert np.abs(some.centroid - surface.centroid).max() < 1.0
-    assert len(surface.subset(10**9).points) == len(surface.points)
+    assert not {*map(tuple, some.points.tolist())} & {*map(tuple, other.points.tolist())}
+    assert len(surface.subset(total).points) == len(surface.subset(10**9).points) == total
+    # Nearly as many choices as there are samples: some would be chosen twice.
+    for part in (some, surface.subset(total - 1)):
+        assert len(np.unique(part.points, axis=0)) == len(part.points) == len(part.values)
+
+
+def test_the_size_is_the_mean_radius_wherever_a_ball_lies():
+    ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 10**2
+    aside = np.roll(ball, (15, -12, 9), axis=(0, 1, 2))
+    assert surface_of(aside).size == surface_of(ball).size == pytest.approx(10, abs=0.2)
 
 
 def test_positions_are_counted_from_the_centre_of_the_cube():
@@ -91,21 +85,138 @@ def test_samples_are_all_lattice_points_of_the_band_with_the_distance_there():
     assert len(index) == in_band.sum()
 
 
-def test_the_size_does_not_depend_on_where_it_is():
-    ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 10**2
-    aside = np.roll(ball, (15, -12, 9), axis=(0, 1, 2))
-    assert surface_of(aside).size == surface_of(ball).size
+def test_starts_are_scipy_s_euler_rotations():
+    for start in euler_starts():
+        expected = Rotation.from_euler("xyz", start.euler_degrees, degrees=True).as_matrix()
+        np.testing.assert_allclose(start.rotation, expected, atol=1e-12)
+    assert [s.euler_degrees for s in euler_starts()][:5] == [
+        (0, 0, 0), (0, 0, 90), (0, 0, 180), (0, 0, 270), (0, 90, 0),
+    ]  # fmt: skip
 
 
-def test_a_subset_has_no_sample_twice_and_others_from_another_start():
-    surface = surface_of(chair())
-    total = len(surface.points)
-    assert len(surface.subset(total).points) == total
-    # Nearly as many choices as there are samples: some would be chosen twice.
-    for count in (300, total - 1):
-        some = surface.subset(count)
-        assert len(np.unique(some.points, axis=0)) == len(some.points) == len(some.values)
-    first, second = (
-        set(map(tuple, surface.subset(300, start).points.tolist())) for start in (0, 300)
+def test_of_64_starts_24_are_different_and_the_others_name_their_twin():
+    starts = euler_starts()
+    assert len(starts) == 64
+    assert len(distinct_starts()) == 24
+    for start in starts:
+        if start.same_as is not None:
+            assert start.same_as < start.index
+            assert starts[start.same_as].same_as is None
+            np.testing.assert_array_equal(start.rotation, starts[start.same_as].rotation)
+
+
+def test_the_distinct_starts_are_the_rotation_group_of_the_cube():
+    keys = {tuple(start.rotation.ravel()) for start in distinct_starts()}
+    products = {
+        tuple((a.rotation @ b.rotation).ravel())
+        for a in distinct_starts()
+        for b in distinct_starts()
+    }
+    assert products == keys
+    assert all(np.linalg.det(start.rotation) > 0 for start in distinct_starts())
+
+
+def test_repeated_candidates_carry_the_scores_of_their_twin():
+    fits = {start.index: (start.index / 64, 0.5) for start in distinct_starts()}
+    candidates = candidates_of(fits)
+    assert [c.index for c in candidates] == list(range(64))
+    for candidate in candidates:
+        twin = candidate.index if candidate.same_as is None else candidate.same_as
+        assert candidate.fitness == twin / 64
+
+
+def test_240_starts_leave_no_orientation_far_from_one():
+    starts = Rotation.from_matrix(so3_starts(240))
+    anywhere = Rotation.random(2000, random_state=0).as_quat()
+    dots = np.abs(anywhere @ starts.as_quat().T).max(axis=1)
+    assert np.degrees(2 * np.arccos(dots.min())) < 40.0
+
+
+def test_the_spirals_advance_by_the_published_numbers():
+    """Alexa 2022: by 1 / sqrt(2) and 1 / psi of a turn, where psi^4 = psi + 4."""
+    psi = max(root.real for root in np.roots([1, 0, 0, -1, -4]) if abs(root.imag) < 1e-12)
+    x, y, z, w = Rotation.from_matrix(so3_starts(50)).as_quat().T
+    # A quaternion and its negative are one rotation, so phases are known to half a turn.
+    for phase, turns in ((np.arctan2(x, y), np.sqrt(2)), (np.arctan2(z, w), psi)):
+        off = (np.diff(phase) - 2 * np.pi / turns) / np.pi
+        np.testing.assert_allclose(off, np.round(off), atol=1e-9)
+    np.testing.assert_allclose(x**2 + y**2, (np.arange(50) + 0.5) / 50)
+    first = np.pi / np.sqrt(2), np.pi / psi
+    found = np.arctan2(x[0], y[0]), np.arctan2(z[0], w[0])
+    np.testing.assert_allclose(np.tan(found), np.tan(first))
+
+
+LINE = np.array([[i, 30, 30] for i in range(10)], dtype=np.uint8)
+
+
+def test_a_shift_along_a_line_by_hand():
+    # Ten voxels in a row, carried three and a half voxels along: six have a
+    # partner half a voxel away, the seventh lies half a voxel past the end.
+    transform = make_transform(np.eye(3), [3.5 / 64, 0, 0])
+    quality = compare(LINE, LINE, transform, radius=1.0)
+    assert quality.fitness == pytest.approx(0.7)
+    assert quality.fitness_backward == pytest.approx(0.7)
+    assert quality.inlier_rmse == pytest.approx(0.5)
+    assert quality.overlap == pytest.approx(0.7)
+
+
+def test_distances_are_in_voxels_of_the_slat_frame():
+    # Twice as large about the cube's centre: neighbours stand two voxels apart,
+    # so every second SLAT voxel is half a voxel from a carried one's centre.
+    pixieverse = np.array([[i, 31, 31] for i in range(28, 36)], dtype=np.uint8)
+    slat = np.array([[i, 31, 31] for i in range(24, 40)], dtype=np.uint8)
+    quality = compare(pixieverse, slat, make_transform(np.eye(3), scale=2.0), radius=1.0)
+    # (i + 0.5 - 32) * 2 + 32 - 0.5 = 2 i - 31.5: half-way between two in x, and
+    # in y and z 31 -> 30.5, half a voxel off the row.
+    expected = np.sqrt(3 * 0.25)
+    assert quality.inlier_rmse == pytest.approx(expected)
+    assert quality.inlier_rmse_backward == pytest.approx(expected)
+    assert quality.fitness == quality.fitness_backward == 1.0
+
+
+def test_the_radius_is_in_voxels_of_the_slat_frame_both_ways():
+    # One PixieVerse voxel off is half a SLAT voxel at this scale, and three are one and a half.
+    pixieverse = np.array([[32, 32, 32]], dtype=np.uint8)
+    for off, near in ((1, 1.0), (3, 0.0)):
+        transform = make_transform(
+            np.eye(3), [0.5 * off / 64 + 0.25 / 64, 0.25 / 64, 0.25 / 64], 0.5
+        )
+        quality = compare(pixieverse, pixieverse, transform, radius=1.0)
+        assert (quality.fitness, quality.fitness_backward) == (near, near)
+        rmse = quality.inlier_rmse, quality.inlier_rmse_backward
+        assert rmse == pytest.approx((0.5 * off * near,) * 2)
+
+
+def test_far_sets_have_no_inlier_and_no_nan():
+    quality = compare(LINE, LINE, make_transform(np.eye(3), [0, 0.4, 0]), radius=1.0)
+    assert (quality.fitness, quality.inlier_rmse, quality.overlap) == (0.0, 0.0, 0.0)
+
+
+def test_voxels_inside_the_slat_do_not_count_against_it():
+    solid = chair()
+    latents = surface_latents(solid)
+    inner = np.array([[30, 30, 25]], dtype=np.uint8)  # a wall between two parts
+    crowded = type(latents)(
+        np.concatenate([latents.coords, inner]), np.zeros((len(latents.coords) + 1, 8), np.float32)
     )
-    assert first.isdisjoint(second)
+    for either in (latents, crowded):
+        quality = measure_quality(field_of(solid), either, np.eye(4), 1.0)
+        assert quality.fitness == quality.fitness_backward == quality.overlap == 1.0
+
+
+@pytest.mark.parametrize(
+    ("fitness", "backward", "verdict", "word"),
+    [
+        (THRESHOLDS.good_fitness, 1.0, Verdict.GOOD, ""),
+        (0.79, 1.0, Verdict.DOUBTFUL, "PixieVerse boundary"),
+        (1.0, 0.79, Verdict.DOUBTFUL, "SLAT boundary"),
+        (1.0, 0.64, Verdict.FAILED, "SLAT boundary"),
+        (THRESHOLDS.failed_fitness, 1.0, Verdict.DOUBTFUL, ""),
+        (0.64, 1.0, Verdict.FAILED, "64.0%"),
+    ],
+)
+def test_verdicts_by_fitness_alone(fitness, backward, verdict, word):
+    given, reasons = verdict_of(Quality(fitness, 0.5, backward, 0.5, 0.9, 1.0), 1.0, 0.05, ties=1)
+    assert given is verdict
+    assert word in " ".join(reasons)
+    assert bool(reasons) == (verdict is not Verdict.GOOD)

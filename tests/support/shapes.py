@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of
-from slatprep.inspect.score import Truth
 from slatprep.parameters import SampleParameters
 from slatprep.pipeline.annotate import look_up
 from slatprep.records import (
@@ -22,8 +21,6 @@ from slatprep.records import (
     Search,
     StructuredLatents,
 )
-
-Case = tuple[MaterialField, StructuredLatents, Truth]
 
 GRID = np.stack(np.meshgrid(*[np.arange(64)] * 3, indexing="ij"), axis=-1)
 
