@@ -9,10 +9,10 @@ import pytest
 import zarr
 from support.made_store import BUILD_ID, IDS, SIZES, edit_attributes, make_store
 
-from slatprep.errors import ConfigError, StoreError, UnknownAssetError
+from slatprep.errors import StoreError, UnknownAssetError
 from slatprep.records import Contents, LatentSpace, Property
 from slatprep.store import Store, open_store
-from slatprep.store.reader import is_store, require_outside
+from slatprep.store.reader import is_store
 
 Made = tuple[Store, dict[str, np.ndarray]]
 NEWER = ("confidence", "expected_accuracy", "unphysical", "contradicted")
@@ -23,13 +23,6 @@ MOST_VOXELS = 64**3
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     path = tmp_path_factory.mktemp("made") / "s.zarr"
     arrays = make_store(path)
-    return open_store(path), arrays
-
-
-@pytest.fixture(scope="module")
-def merged(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    path = tmp_path_factory.mktemp("merged") / "s.zarr"
-    arrays = make_store(path, merged=True)
     return open_store(path), arrays
 
 
@@ -65,6 +58,7 @@ def test_each_asset_has_its_own_rows(made):
         assert asset.grid_properties.tobytes() == arrays["grid/properties"][row].tobytes()
         for name, value in asset.columns.items():
             assert same(value, arrays[f"asset/{name}"][row]), name
+    assert "background" not in store.attributes  # It is the usual one.
     assert list(store.read(0)) == ["coords", "feats", "properties"]
     assert store.read(0, ()) == {}
 
@@ -81,8 +75,9 @@ def test_an_asset_without_several_annotations_says_nothing_of_how_they_differ(ma
     assert not store.asset("ant").merged
 
 
-def test_an_asset_of_several_annotations_says_how_they_differ(merged):
-    store, arrays = merged
+def test_an_asset_of_several_annotations_says_how_they_differ(tmp_path):
+    arrays = make_store(tmp_path / "s.zarr", merged=True)
+    store = open_store(tmp_path / "s.zarr")
     assert store.merges
     for row, asset_id in enumerate(IDS):
         asset = store.asset(asset_id)
@@ -292,23 +287,3 @@ def test_formats_that_are_not_read_are_refused(own, version):
     with pytest.raises(StoreError, match=f"has format version {version!r}; this slatprep reads"):
         open_store(own)
     assert is_store(own)
-
-
-def test_a_table_of_other_width_than_attributes_say_is_refused(own):
-    latents = open_store(own).attributes["latents"]
-    edit_attributes(own, latents={**latents, "channels": 7, "mean": [], "std": []})
-    with pytest.raises(StoreError, match="latents says 7 columns of voxel/feats; expected 8"):
-        open_store(own)
-
-
-def test_nothing_is_written_into_a_store(own):
-    require_outside(own.parent / "other")
-    require_outside(own.parent)
-    with pytest.raises(ConfigError, match=r"s\.zarr is a store; expected a path outside"):
-        require_outside(own)
-    for inside in (own / "x", own / "voxel" / "feats" / "c"):
-        with pytest.raises(ConfigError, match=f"{inside.name} lies inside the store {own};"):
-            require_outside(inside)
-    edit_attributes(own, format="other")
-    assert not is_store(own)
-    require_outside(own / "x")

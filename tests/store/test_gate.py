@@ -1,10 +1,15 @@
-"""What a stranger's store may name: nothing that runs code, nothing that waits, nothing huge."""
+"""Rows read by many at once; and a stranger's store names nothing huge, nothing that waits."""
 
+import json
+import multiprocessing
 import os
 import pickle
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +17,7 @@ import numcodecs
 import numpy as np
 import pytest
 import zarr
+from google_crc32c import value as crc32c
 from support.commands import refused, run
 from support.made_store import edit_json
 
@@ -19,8 +25,9 @@ from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, StoreParameters
 from slatprep.pipeline.dataset import build_store
-from slatprep.store import open_store
+from slatprep.store import Store, open_store
 from slatprep.store.contract import gate_findings
+from slatprep.store.layout import ARRAYS
 
 META = "consolidated_metadata"
 
@@ -190,3 +197,138 @@ def test_many_assets_must_have_bytes(copy):
     edit_root(copy, claim)
     with pytest.raises(StoreError, match=r"has 16777216 assets in \d+ bytes"):
         len(open_store(copy))
+
+
+def digest(row: dict[str, np.ndarray]) -> list[bytes]:
+    return [array.tobytes() for array in row.values()]
+
+
+@pytest.mark.parametrize("method", ["threads", "fork", "spawn"])
+def test_threads_and_processes_share_a_store(store, method):
+    opened = open_store(store)
+    expected = [digest(opened.read(index)) for index in range(5)]
+    assert len(pickle.dumps(opened)) < 500  # Whatever has been read stays behind.
+    context = multiprocessing.get_context(None if method == "threads" else method)
+    with ThreadPool(8) if method == "threads" else context.Pool(2) as pool:
+        fresh = open_store(store)
+        rows = pool.starmap(Store.read, [(fresh, index % 5) for index in range(100)])
+    assert [digest(row) for row in rows] == expected * 20
+
+
+def test_a_replaced_store_is_not_mixed_with_the_new_one(copy):
+    old = open_store(copy)
+    assert len(old) == 5
+    copy.rename(copy.with_name("gone"))
+    shutil.copytree(copy.with_name("gone"), copy)
+    shutil.rmtree(copy.with_name("gone"))
+    with pytest.raises(StoreError, match="was the store replaced"):
+        old.read(0)
+
+
+def test_opening_reads_one_file_needs_no_other_library_and_closes_quietly(store):
+    code = f"""
+import sys
+opened = []
+sys.addaudithook(lambda event, args: event == "open" and opened.append(str(args[0])))
+from slatprep.store import open_store
+store = open_store({str(store)!r})
+# The folder itself is opened, too, so that what is read stays of one store.
+files = [name for name in opened if name.startswith({str(store / "x")[:-1]!r})]
+assert files == [{str(store / "zarr.json")!r}], files
+assert store.read(2)["feats"].shape[1] == 8
+store.asset("cup").grid_properties, store.column("verdict")
+assert "zarr" not in sys.modules
+import slatprep.cli.commands, slatprep.storage.remote
+assert not {{"fsspec", "s3fs"}} & set(sys.modules)
+del store
+"""
+    told = subprocess.run(
+        [sys.executable, "-X", "dev", "-c", code], capture_output=True, text=True, check=True
+    )
+    assert "ResourceWarning" not in told.stderr
+
+
+def edited(text: str, change: dict[str, object]) -> str:
+    document = json.loads(text)
+    for place, value in change.items():
+        target = document[META]["metadata"]
+        *keys, last = place.split("|")
+        for key in keys:
+            target = target[int(key) if key.isdigit() else key]
+        target[int(last) if last.isdigit() else last] = value
+    return json.dumps(document)
+
+
+FEATS = "voxel/feats|"
+SHARDING = "codecs|0|configuration|"
+
+HOSTILE = {
+    "more voxels than files": {"voxel/coords|shape": [10**9, 3]},
+    "a number of rows beyond reason": {"voxel/coords|shape": [10**15, 3]},
+    "more assets than files": {
+        f"{layout.name}|shape|0": 10**7 + (layout.name == "asset/offset")
+        for layout in ARRAYS
+        if layout.name.startswith("asset/")
+    },
+    "huge chunks": {
+        FEATS + SHARDING + "chunk_shape": [2**40, 8],
+        FEATS + "chunk_grid|configuration|chunk_shape": [2**40, 8],
+    },
+    "huge shards": {FEATS + "chunk_grid|configuration|chunk_shape": [2**50, 8]},
+    "chunks of nothing": {FEATS + SHARDING + "chunk_shape": [0, 8]},
+    "negative chunks": {FEATS + SHARDING + "chunk_shape": [-128, 8]},
+    "wide rows": {FEATS + "shape": [10, 10**9]},
+    "no shape": {FEATS + "shape": None},
+    "no codecs": {FEATS + "codecs": []},
+    "other metadata": {"voxel/feats": "feats"},
+}
+
+
+HOSTILE_READER = """
+import json, resource, sys
+from pathlib import Path
+from slatprep.errors import StoreError
+from slatprep.store import open_store
+import numpy, numcodecs, google_crc32c, slatprep.inspect.check
+
+def grown():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+
+place, before = Path(sys.argv[1]), grown()
+for case, document in json.loads(sys.stdin.read()).items():
+    (place / "zarr.json").write_text(document)
+    try:
+        store = open_store(str(place))
+        store.read(0)
+        store.asset(store.ids[0])
+        said = "read"
+    except StoreError as error:
+        said = str(error)
+    print(json.dumps([case, said, grown() - before]), flush=True)
+"""
+
+
+def test_hostile_metadata_cost_neither_memory_nor_sense(copy):
+    sound = (copy / "zarr.json").read_text()
+    documents = {case: edited(sound, change) for case, change in HOSTILE.items()}
+    done = subprocess.run(
+        [sys.executable, "-c", HOSTILE_READER, str(copy)],
+        input=json.dumps(documents), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [case for case, _, _ in answers] == list(HOSTILE)
+    for case, message, grown in answers:
+        assert str(copy) in message, case
+        assert grown < 100, case
+
+
+def test_a_chunk_that_claims_to_be_huge_is_not_unpacked(copy):
+    """A store of bombs: every checksum is right, each chunk unpacks to a gigabyte."""
+    bomb = numcodecs.Zstd(1).encode(bytes(2**30))
+    bomb += crc32c(bytes(bomb)).to_bytes(4, "little")
+    (copy / "asset/id/c/0").write_bytes(bomb)
+    (copy / "asset/fitness/c/0").write_bytes(bomb)
+    store = open_store(copy)
+    for name in ("id", "fitness"):
+        with pytest.raises(StoreError, match="it holds 1073741824 bytes; expected"):
+            store.column(name)

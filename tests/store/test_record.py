@@ -1,14 +1,25 @@
+"""Records and the attributes of a root: good ones are read, each fault is told by its name."""
+
 import hashlib
 import json
 from dataclasses import replace
 from math import nan
+from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
+from support.made_store import BUILD_ID
 
 from slatprep.pipeline.dataset import BuildSummary
+from slatprep.records import PIXIEVERSE, LatentSpace, Property
 from slatprep.store import open_store
+from slatprep.store.attributes import (
+    RootAttributes,
+    read_attributes,
+    segments_of,
+    width_findings,
+)
 from slatprep.store.record import AssetRecord, FailedRecord
 from slatprep.store.record_json import (
     FOLDER,
@@ -172,3 +183,129 @@ def test_the_id_is_of_the_records_and_of_what_the_store_says_of_itself(mixed_bui
     for line in sorted(lines_of(mixed_build), key=lambda line: json.loads(line)["asset_id"]):
         digest.update(hashlib.sha256(line).digest())
     assert digest.hexdigest() == mixed_build.build_id
+
+
+def said() -> dict[str, Any]:
+    """Attributes of a store, written out."""
+    span = {"log10": True, "lo": 2.0, "hi": 5.0, "source": "pixie"}
+    return {
+        "format": "slatprep-store",
+        "format_version": 1,
+        "resolution": 64,
+        "material_classes": list(PIXIEVERSE.classes),
+        "property_columns": ["density", "hue"],
+        "property_units": ["kg/m^3", "1"],
+        "normalization": {
+            # As JSON has them: in no order.
+            "hue": {**span, "log10": False, "lo": -1.0, "hi": 1.0},
+            "density": span,
+        },
+        "latents": {"encoder": "trellis", "channels": 8, "resolution": 64},
+        "manifest": BUILD_ID,
+        "build": {
+            "parameters": {"align": {"radius": 1.5}, "sample": {"method": "nearest"}},
+            "versions": {"slatprep": "0"},
+        },
+    }
+
+
+def read(attributes: dict[str, Any]) -> RootAttributes:
+    found = read_attributes(attributes)
+    assert isinstance(found, RootAttributes), found
+    return found
+
+
+def test_ranges_and_tables_are_in_the_order_of_the_columns():
+    found = read(said())
+    spans = [(one.name, one.log10, one.lo, one.hi) for one in found.ranges.ranges]
+    assert spans == [("density", True, 2.0, 5.0), ("hue", False, -1.0, 1.0)]
+    assert found.ranges.source == "pixie"
+    assert found.contents.properties == (
+        Property("density", "kg/m^3", True),
+        Property("hue", "1", False),
+    )
+    assert found.contents.latents == LatentSpace("trellis", 8, 64)
+    assert found.build.parameters.sample.method == "nearest"
+
+
+def test_a_store_may_have_a_single_property():
+    attributes = said()
+    attributes["property_columns"], attributes["property_units"] = ["hue"], ["1"]
+    del attributes["normalization"]["density"]
+    found = read(attributes)
+    assert [one.name for one in found.ranges.ranges] == ["hue"]
+    assert found.ranges.source == "pixie"
+
+
+def test_what_newer_versions_add_is_left_alone():
+    attributes = said()
+    attributes["colour"] = "new"
+    attributes["build"]["parameters"]["sample"]["colour"] = "new"
+    attributes["build"]["parameters"]["align"]["colour"] = "new"
+    assert read(attributes) == read(said())
+    assert "colour" in attributes["build"]["parameters"]["sample"]
+
+
+LONG = "x" * 200
+SAME = "property_columns and normalization must name the same properties"
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "what", "expected"),
+    [
+        ("format", "other", "format is 'other'", "'slatprep-store'"),
+        ("format_version", 2, "format_version is 2", "1"),
+        ("normalization/hue/lo", "1", "normalization/hue/lo is '1'", "a valid number"),
+        ("normalization/hue/log10", "yes", "normalization/hue/log10 is 'yes'", "a valid boolean"),
+        ("normalization/hue/hi", -1.0, "normalization/hue is {", "lo must be less than hi"),
+        ("property_columns", ["density", "density"], " is {", SAME),
+        ("property_columns", ["density", "hue", "hue"], " is {", SAME),
+        ("property_columns", ["density", "taste"], " is {", SAME),
+        ("property_units", ["1"], " is {", "property_units must have a unit for each of"),
+        ("manifest", LONG, f"manifest is '{LONG[:99]}", ""),
+        ("manifest", None, "manifest is missing", ""),
+        ("build/versions", None, "build/versions is missing", ""),
+        ("build/parameters", None, "build/parameters is missing", ""),
+        ("build/parameters", 5, "build/parameters is 5", ""),
+        ("build/parameters", {"sample": 5}, "build/parameters", ""),
+        ("build/parameters", {"sample": None}, "build/parameters", ""),
+    ],
+)
+def test_what_is_wrong_is_told_by_its_name(path, value, what, expected):
+    found = read_attributes(place(said(), path, value))
+    assert isinstance(found, tuple)
+    assert len(found) == 1 or path == "build/parameters"
+    for finding in found:
+        assert finding.file == "zarr.json"
+        assert finding.what.startswith(f"attribute {what}")
+        assert len(finding.what) <= len(f"attribute {path} is ") + 100
+        assert finding.expected.startswith(expected)
+
+
+def test_every_fault_is_told():
+    found = read_attributes(place(place(said(), "manifest", None), "resolution", 32))
+    told = {"attribute manifest is missing", "attribute resolution is 32"}
+    assert {one.what for one in found} == told
+
+
+def test_arrays_of_another_width_are_told_and_others_left_to_those_who_check_shapes():
+    found = read(said())
+    fine = {"voxel/feats": {"shape": [9, 8]}, "voxel/properties": {"shape": [9, 2]}}
+    assert list(width_findings(found, fine)) == []
+    (finding,) = width_findings(found, {**fine, "voxel/feats": {"shape": [8, 9]}})
+    assert finding.what == "attribute latents says 8 columns of voxel/feats"
+    assert finding.expected == "9, as the array has"
+    (finding,) = width_findings(found, {**fine, "voxel/properties": {"shape": [2, 3]}})
+    assert finding.what == "attribute property_columns says 2 columns of voxel/properties"
+    for odd in (None, [9], [9, 5, 5], "ab", {}):
+        assert list(width_findings(found, {**fine, "voxel/feats": {"shape": odd}})) == []
+    for odd in (None, 5, {}):
+        assert list(width_findings(found, {**fine, "voxel/feats": odd})) == []
+    assert list(width_findings(found, {})) == []
+
+
+def test_segments_begin_where_ids_begin_anew():
+    assert segments_of([]) == [0]
+    assert segments_of(["b"]) == [0]
+    assert segments_of(["a", "b", "c"]) == [0]
+    assert segments_of(["c", "a", "b", "a", "z"]) == [0, 1, 3]
