@@ -1,8 +1,20 @@
+"""Files and folders take their places at once, and nothing of other users is touched."""
+
+import errno
+import multiprocessing
+import os
+import shutil
 from pathlib import Path
 
 import pytest
+from support.synthetic import Made
 
+from slatprep.errors import StoreError
+from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.join import subset_store
+from slatprep.pipeline.work import work_beside
 from slatprep.storage import atomic
+from slatprep.storage.atomic import staged, take_lock, writing
 
 
 def directory(path: Path, content: str) -> Path:
@@ -26,3 +38,208 @@ def test_a_new_that_does_not_exist_leaves_the_old(tmp_path):
     with pytest.raises(OSError):
         atomic.replace_directory(tmp_path / "absent", tmp_path / "store")
     assert (tmp_path / "store" / "file").read_text() == "old"
+
+
+MINE = "what somebody else wrote"
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Path:
+    """A file of somebody else, in a folder of theirs."""
+    (tmp_path / "theirs").mkdir()
+    file = tmp_path / "theirs" / "notes.txt"
+    file.write_text(MINE)
+    return file
+
+
+def refused(target: Path, fresh: bool = False) -> str:
+    with pytest.raises(StoreError) as error, work_beside(target, fresh=fresh):
+        pass
+    return str(error.value)
+
+
+AS_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="gives something away")
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ("link", ".s.zarr.work: is no folder"),
+        ("made by others", "holds notes.txt"),
+        pytest.param("another user's", "belongs to user 12345", marks=AS_ROOT),
+        ("spool is a link", "spool: is no folder"),
+        ("spool is a file", "spool: is no folder"),
+    ],
+)
+def test_a_work_folder_that_is_not_a_builds_own_is_refused(tmp_path, theirs, how, told):
+    work = tmp_path / ".s.zarr.work"
+    if how == "link":
+        work.symlink_to(theirs.parent)
+    else:
+        work.mkdir()
+    if how == "made by others":
+        shutil.move(theirs, work)
+        theirs = work / theirs.name
+    elif how == "another user's":
+        os.chown(work, 12345, 12345)
+    elif "spool" in how:
+        (work / "lock").touch()
+        (work / "spool").touch() if "file" in how else (work / "spool").symlink_to(theirs.parent)
+    assert told in refused(tmp_path / "s.zarr", fresh="spool" in how)
+    assert theirs.read_text() == MINE
+
+
+def test_what_is_not_a_builds_own_stays_in_its_folder(tmp_path):
+    folder = tmp_path / ".s.zarr.work"
+    (folder / "build-1").mkdir(parents=True)
+    (folder / "lock").touch()
+    (folder / "notes.txt").write_text(MINE)
+    with work_beside(tmp_path / "s.zarr"):
+        assert not (folder / "build-1").exists()
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_nobody_else_may_enter_the_work_folder(tmp_path):
+    with work_beside(tmp_path / "s.zarr") as work:
+        assert work.scratch.parent.stat().st_mode & 0o077 == 0
+
+
+def test_a_lock_that_is_a_link_or_holds_something_else_is_left_alone(tmp_path, theirs):
+    (tmp_path / "lock").symlink_to(theirs)
+    with pytest.raises(OSError, match="symbolic links"):
+        take_lock(tmp_path / "lock", "taken")
+    with pytest.raises(StoreError, match="holds something else than a lock"):
+        take_lock(theirs, "taken")
+    assert theirs.read_text() == MINE
+
+
+def test_a_lock_in_a_folder_that_is_gone_is_not_looked_for_without_end(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(StoreError, match=r"lock: cannot be locked.* expected a folder that stays"):
+        take_lock(Path("lock"), "taken")
+
+
+def test_a_lock_that_cannot_be_taken_leaves_nothing_open(tmp_path, monkeypatch):
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", full)
+    (tmp_path / "deep").write_text("[" * 4096)
+    before = len(list(Path("/dev/fd").iterdir()))
+    with pytest.raises(StoreError, match="holds something else than a lock"):
+        take_lock(tmp_path / "deep", "taken")
+    with pytest.raises(OSError, match="No space left"):
+        take_lock(tmp_path / "lock", "taken")
+    assert len(list(Path("/dev/fd").iterdir())) == before
+
+
+def write_report(folder: Path) -> None:
+    with staged(folder / "r.html") as file:
+        file.write_text("report")
+    assert (folder / "r.html").read_text() == "report"
+
+
+@pytest.mark.parametrize("whose", ["link", pytest.param("another user's", marks=AS_ROOT)])
+def test_a_partial_file_that_is_not_ours_is_left_alone(tmp_path, theirs, whose):
+    other = tmp_path / ".r.html.partial"
+    if whose == "link":
+        other.symlink_to(theirs)
+    else:
+        other.write_text(MINE)
+        os.chown(other, 12345, 12345)
+    write_report(tmp_path)
+    assert (other.read_text(), theirs.read_text()) == (MINE, MINE)
+    assert other.is_symlink() is (whose == "link") and not (tmp_path / "r.html").is_symlink()
+
+
+def test_what_a_killed_process_left_is_replaced(tmp_path):
+    (tmp_path / ".r.html.partial").write_text("a longer report, half of")
+    write_report(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
+    (tmp_path / "any").touch()
+    assert (tmp_path / "r.html").stat().st_mode == (tmp_path / "any").stat().st_mode
+    for _ in range(2):
+        os.close(take_lock(tmp_path / "lock", "taken"))
+
+
+def test_two_processes_that_write_one_file_each_write_it_whole(tmp_path):
+    report = tmp_path / "r.html"
+
+    def write_theirs() -> None:
+        with staged(report) as file:
+            file.write_text("theirs")
+
+    with staged(report) as file, file.open("w") as ours:
+        ours.write("ou")
+        other = multiprocessing.get_context("fork").Process(target=write_theirs)
+        other.start()
+        other.join()
+        assert (other.exitcode, report.read_text()) == (0, "theirs")
+        ours.write("rs")
+    assert report.read_text() == "ours"
+    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
+
+
+@pytest.mark.parametrize(
+    ("code", "advice"), [(errno.ENOSPC, "Make room there"), (errno.EACCES, "may be written")]
+)
+def test_what_to_do_about_a_disk_depends_on_what_it_says(code, advice):
+    with pytest.raises(StoreError, match=advice), writing("s.zarr", Path("/data")):
+        raise OSError(code, os.strerror(code))
+
+
+def test_a_full_disk_before_anything_is_written_is_told(tmp_path, monkeypatch):
+    """Inodes may run out between the lock and the next folder."""
+
+    def none_left(*_: object, **__: object) -> str:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("tempfile.mkdtemp", none_left)
+    assert "cannot write there (No space left" in refused(tmp_path / "s.zarr")
+
+
+@pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
+def test_a_folder_for_records_that_holds_others_is_refused(undisturbed, tmp_path, file):
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / file).write_text('{"mine": 1}\n')
+    with pytest.raises(StoreError, match=f"records: holds a {file} that is not slatprep's"):
+        build_store(
+            undisturbed[0].parameters(), tmp_path / "s.zarr", manifests=tmp_path / "records"
+        )
+    assert (tmp_path / "records" / file).read_text() == '{"mine": 1}\n'
+
+
+def copied(undisturbed: Made, folder: Path, name: str) -> Path:
+    """Copy a store and its records, which call it ``s.zarr``, to another name."""
+    for suffix in (".zarr", ".manifests"):
+        shutil.copytree(undisturbed[1].with_suffix(suffix), folder / f"{name}{suffix}")
+    return folder / f"{name}.zarr"
+
+
+def test_two_stores_in_a_folder_do_not_share_records(undisturbed, tmp_path):
+    """``s`` and ``s.zarr`` both have ``s.manifests`` by default."""
+    parameters = undisturbed[0].parameters("pixie")
+    first, second = copied(undisturbed, tmp_path, "s"), tmp_path / "s"
+    records = (tmp_path / "s.manifests" / "build.json").read_bytes()
+    told = r"s\.manifests: holds the records of .*s\.zarr; expected --manifests FOLDER"
+    for named in (None, tmp_path / "s.manifests"):
+        with pytest.raises(StoreError, match=told):
+            build_store(parameters, second, manifests=named)
+    with pytest.raises(StoreError, match=told):
+        subset_store(first, second, ["a"])
+    assert not second.exists()
+    assert (tmp_path / "s.manifests" / "build.json").read_bytes() == records
+    build_store(parameters, second, manifests=tmp_path / "other")
+    build_store(parameters, first)
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside one of its old name"])
+def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(undisturbed, tmp_path, beside):
+    renamed = copied(undisturbed, tmp_path, "new")
+    if beside:
+        copied(undisturbed, tmp_path, "s")
+    build_store(undisturbed[0].parameters(), renamed)
+    assert b'"new.zarr"' in (tmp_path / "new.manifests" / "build.json").read_bytes()
+    assert not beside or b'"s.zarr"' in (tmp_path / "s.manifests" / "build.json").read_bytes()

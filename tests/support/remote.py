@@ -29,11 +29,15 @@ def built(folder: Path, *ids: str, seed: int = 0) -> Made:
     return dataset, folder / "s.zarr"
 
 
-def raising(error: Exception) -> Callable[..., Any]:
-    """Return a method of a client that fails whatever it is asked."""
+def raising(
+    error: Exception, method: Any = None, where: Callable[[str, Any], bool] = lambda *_: True
+) -> Callable[..., Any]:
+    """Return what a method of a client is that fails where path and options are such."""
 
-    async def raises(*_: Any, **__: Any) -> None:
-        raise error
+    async def raises(client: Any, path: str, *given: Any, **options: Any) -> Any:
+        if where(path, options):
+            raise error
+        return await method(client, path, *given, **options)
 
     return raises
 

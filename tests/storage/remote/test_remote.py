@@ -1,18 +1,23 @@
-"""Places on object stores, which stand where paths of the local disk stand."""
+"""Places on object stores stand where paths do; either client reads their bytes, or copies."""
 
+import multiprocessing
 import os
 import pickle
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.commands import refused
 
 from slatprep.errors import ConfigError
 from slatprep.readers.files import load_source
 from slatprep.records import Place
+from slatprep.storage.cache import VARIABLE, cache_folder, cached_file, folder_for
 from slatprep.storage.place import place_of, storage_of
-from slatprep.storage.remote import RemotePlace
+from slatprep.storage.ranges import range_reader
+from slatprep.storage.remote import RemoteFile, RemotePlace
+from slatprep.store import open_store
 
 
 @pytest.mark.parametrize(
@@ -88,13 +93,6 @@ def test_what_cannot_be_read_is_named(s3, bucket):
         place_of("s4://bucket/x").read_bytes()
 
 
-def test_missing_credentials_are_told_of_the_place(bucket, monkeypatch, new_clients):
-    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
-    new_clients()
-    with pytest.raises(OSError, match=f"AWS_PROFILE: 's3://{bucket}/x'"):
-        place_of(f"s3://{bucket}/x").read_bytes()
-
-
 def test_objects_that_no_path_could_name_are_left_out(s3, bucket):
     for key in ("a", "b/c", "../up", "b/../../up", "d//e", "./f", "g/", "back\\slash"):
         s3.pipe_file(f"{bucket}/root/{key}", b"x")
@@ -128,3 +126,93 @@ def test_without_the_extra_a_url_says_what_to_install(monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)
     told = refused("info", "s3://bucket/demo.zarr")
     assert "s3://bucket/demo.zarr" in told and "pip install 'slatprep[remote]'" in told
+
+
+@pytest.fixture
+def obstore(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("obstore")
+    monkeypatch.setenv("SLATPREP_OBSTORE", "yes")
+
+
+@pytest.mark.usefixtures("obstore")
+def test_a_store_reads_as_by_s3fs(url, s3, undisturbed, requests, monkeypatch):
+    s3.put(str(undisturbed[1]), url, recursive=True)
+    requests.made.clear()
+    by_obstore = [asset.feats for asset in open_store(url)]
+    assert requests.of("get_object") == []  # s3fs was asked for no bytes.
+    monkeypatch.setenv("SLATPREP_OBSTORE", "no")
+    for here, there in zip(by_obstore, open_store(url), strict=True):
+        np.testing.assert_array_equal(here, there.feats)
+    assert requests.of("get_object")
+
+
+@pytest.mark.usefixtures("obstore")
+def test_ranges_and_faults_are_those_of_a_file(bucket, s3):
+    s3.pipe_file(f"{bucket}/a", b"0123456789")
+    file = RemoteFile(place_of(f"s3://{bucket}/a"))  # type: ignore[arg-type]
+    assert file.pread(4, 3) == b"3456"
+    assert file.pread(100, 8) == b"89"
+    assert file.pread(5, 10) == b""
+    with pytest.raises(FileNotFoundError, match=f"s3://{bucket}/b"):
+        RemoteFile(place_of(f"s3://{bucket}/b")).pread(1, 0)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("obstore")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a fork")
+def test_a_forked_process_reads_by_s3fs(bucket, s3):
+    s3.pipe_file(f"{bucket}/a", b"0123456789")
+
+    def read() -> bytes:
+        return RemoteFile(place_of(f"s3://{bucket}/a")).pread(4, 3)  # type: ignore[arg-type]
+
+    assert read() == b"3456"
+    forked = multiprocessing.get_context("fork")
+    answers = forked.Queue()
+    child = forked.Process(target=lambda: answers.put((range_reader(bucket) is None, read())))
+    child.start()
+    assert answers.get(timeout=300) == (True, b"3456")
+    child.join()
+
+
+@pytest.mark.usefixtures("obstore")
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("AWS_SECRET_ACCESS_KEY", ""), ("AWS_PROFILE", "mine"), ("SLATPREP_OBSTORE", "no")],
+)
+def test_without_known_credentials_s3fs_reads(name, value, monkeypatch):
+    monkeypatch.setenv(name, value)
+    assert range_reader("bucket") is None
+
+
+def test_a_copy_serves_while_the_object_is_the_same(s3, bucket):
+    place = place_of(f"s3://{bucket}/latents.h5")
+    assert isinstance(place, RemotePlace)
+    s3.pipe_file(f"{bucket}/latents.h5", b"first")
+    copy = cached_file(place)
+    assert copy.read_bytes() == b"first"
+    copy.write_bytes(b"mark!")  # so that one sees whether it is fetched again
+    assert cached_file(place).read_bytes() == b"mark!"
+
+    s3.pipe_file(f"{bucket}/latents.h5", b"other")
+    other = cached_file(place)
+    assert other.read_bytes() == b"other"
+    assert list(folder_for(place).iterdir()) == [other]
+
+
+def test_an_object_that_is_not_there_leaves_no_copy(bucket):
+    place = place_of(f"s3://{bucket}/nothing.h5")
+    assert isinstance(place, RemotePlace)
+    with pytest.raises(FileNotFoundError):
+        cached_file(place)
+    assert not folder_for(place).exists()
+
+
+def test_where_the_folder_is(monkeypatch, tmp_path):
+    folders = {VARIABLE: "own", "XDG_CACHE_HOME": "xdg", "HOME": "home"}
+    for variable, folder in folders.items():
+        monkeypatch.setenv(variable, str(tmp_path / folder))
+    for variable, found in zip(
+        folders, ("own", "xdg/slatprep", "home/.cache/slatprep"), strict=True
+    ):
+        assert cache_folder() == tmp_path / found
+        monkeypatch.delenv(variable)

@@ -10,7 +10,7 @@ import pytest
 from s3fs.core import S3FileSystem
 from support.dask_processes import Processes, end, wait_for_workers, wait_until
 from support.faults import environment as with_fault
-from support.remote import Dataset, Made, current, put, versions
+from support.remote import Dataset, Made, current, put, raising, versions
 from support.trees import contents, tree
 
 from slatprep.errors import SlatprepError, StoreError
@@ -185,14 +185,8 @@ def test_a_build_that_failed_leaves_finished_assets_but_no_mark(s3, url):
 def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
     s3, url, change_client, tmp_path
 ):
-    listing, refused = S3FileSystem._lsdir, [True]
-
-    async def listed(*arguments: Any, **options: Any) -> Any:
-        if refused:
-            raise PermissionError(13, "Access Denied")
-        return await listing(*arguments, **options)
-
-    change_client("_lsdir", listed)
+    refused = [PermissionError(13, "Access Denied")]
+    change_client("_lsdir", raising(refused[0], S3FileSystem._lsdir, lambda *_: bool(refused)))
     with (
         pytest.warns(UserWarning, match="could not be removed .*Access Denied"),
         work_beside(place_of(url), private_disks=True) as work,

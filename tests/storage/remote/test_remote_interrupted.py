@@ -1,18 +1,25 @@
-"""Builds on S3 that are killed, overtaken or left without an answer."""
+"""Builds on S3 that are killed, overtaken, spoiled or updated."""
 
+import json
 import multiprocessing
 import os
+import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from s3fs.core import S3FileSystem
+from support import remote
 from support.faults import inject, kill_self
-from support.remote import Dataset, current, put, versions
+from support.remote import Dataset, Made, current, put, raising, versions
 from support.trees import contents, tree
 
 from slatprep.errors import StoreError
+from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import build_store
 from slatprep.storage.place import place_of
 from slatprep.storage.upload import published_state, upload_store
@@ -170,3 +177,79 @@ def test_a_lost_answer_makes_no_failure_of_a_success_and_no_word_false(
     assert len(lost) == 1
     lost.clear()
     assert current(s3, url) == tree(undisturbed[1])
+
+
+def test_spoiled_answers_end_in_the_same_store_or_in_words():
+    """The short version of ``benchmarks/faulty_s3.py``."""
+    script = str(Path(__file__).parents[3] / "benchmarks" / "faulty_s3.py")
+    command = [sys.executable, script, "--runs", "4", "--seed", "1"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["runs"], told["harm"]) == (4, 0)
+    assert told["faults"] > 0
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Four assets and their store; nobody may change them."""
+    return remote.built(tmp_path_factory.mktemp("first"), "a", "c", "e", "g")
+
+
+@pytest.fixture
+def built(first: Made, url: str, tmp_path: Path, files_are_old: None, few_are_new: None) -> Made:
+    """Four assets; a store of them on S3 that another machine put there, and the same here."""
+    sources = shutil.copytree(first[0].root, tmp_path / "sources")
+    beside = shutil.copytree(first[1], tmp_path / "s.zarr")
+    put(beside, url)
+    return Dataset(sources), beside
+
+
+def below(names: list[str], version: str) -> set[str]:
+    return {name.partition(f"{version}/")[2] for name in names} - {""}
+
+
+def test_shards_that_did_not_change_are_copied_by_the_server(s3, url, built, requests, monkeypatch):
+    dataset, beside = built
+    before = tree(beside)
+    dataset.add("b", seed=1)
+    begun: list[str] = []
+    inject(monkeypatch, lambda step, name: begun.append(name) if step == "asset begun" else None)
+    old = open_store(url).path.name
+    requests.made.clear()
+    build_store(dataset.parameters("pixie"), url)
+    assert begun == ["b"]
+    new = open_store(url).path.name
+    build_store(dataset.parameters("pixie"), beside)
+    after = tree(beside)
+    # The same bytes as where the store lies on a disk, which took over the same shards.
+    assert current(s3, url) == after
+    groups = ("voxel/", "grid/", "asset/record/")
+    same = {name for name in before.items() & after.items() if name[0].startswith(groups)}
+    # What names the axes is written with every store.
+    axes = {"axis", "property", "x", "y", "z"}
+    same_shards = {name for name, _ in same if "/c/" in name and name.split("/")[1] not in axes}
+    assert len(same_shards) > 20
+    copied = below(requests.of("copy_object"), new)
+    assert same_shards == copied
+    # Of what was copied nothing came here, and nothing went back.
+    voxels = {name for name in copied if not name.startswith("asset/")}
+    assert voxels
+    assert not voxels & below(requests.of("get_object"), old)
+    assert not copied & below(requests.of("put_object"), new)
+    assert verify_store(url, sources=True).ok
+
+
+def test_an_update_that_cannot_copy_changes_nothing_and_what_is_gone_is_made_again(s3, url, built):
+    dataset, beside = built
+    dataset.add("b", seed=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(S3FileSystem, "_cp_file", raising(PermissionError("Access Denied")))
+        with pytest.raises(StoreError, match=r"cannot be written .*nothing was replaced"):
+            build_store(dataset.parameters("pixie"), url)
+    assert current(s3, url) == tree(beside)
+    s3.rm(f"{open_store(url).path}/voxel/feats/c/0/0")
+    summary = build_store(dataset.parameters("pixie"), url)
+    assert any("voxel/feats/c/0/0" in told for told in summary.damaged)
+    build_store(dataset.parameters("pixie"), beside)
+    assert current(s3, url) == tree(beside)
