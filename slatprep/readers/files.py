@@ -288,8 +288,11 @@ def _header(
     wanted = math.prod(shape) * dtype.itemsize
     held = size - offset
     if held != wanted:
-        fault = f"its header announces {wanted} bytes of data, it has {held}"
-        raise InputError(where, f"is truncated or damaged: {fault}", _COMPLETE)
+        raise InputError(
+            where,
+            f"is truncated or damaged: its header announces {wanted} bytes of data, it has {held}",
+            _COMPLETE,
+        )
     return shape, fortran, dtype, offset
 
 

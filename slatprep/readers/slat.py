@@ -218,8 +218,9 @@ def check_coords(
     if (counts > 1).any():
         rows = np.flatnonzero(counts[flat] > 1)
         first, second = np.flatnonzero(flat == flat[rows[0]])[:2]
-        twice = f"coordinate {tuple(voxels[first].tolist())} occurs twice"
-        raise InputError(where, f"{twice}, in rows {first} and {second}", "each coordinate once")
+        place = tuple(voxels[first].tolist())
+        fault = f"coordinate {place} occurs twice, in rows {first} and {second}"
+        raise InputError(where, fault, "each coordinate once")
     return voxels
 
 
