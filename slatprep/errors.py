@@ -81,5 +81,6 @@ def needing(what: str, extra: str, kind: type[SlatprepError] = ConfigError) -> I
     try:
         yield
     except ImportError as error:
+        package = f"the package {error.name}" if error.name else f"a package that fails ({error})"
         way = f"install it with `pip install 'slatprep[{extra}]'`"
-        raise kind(f"{what} the package {error.name}; {way}") from error
+        raise kind(f"{what} {package}; {way}") from error

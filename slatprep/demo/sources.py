@@ -180,7 +180,7 @@ def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[
     """
     root.mkdir(parents=True, exist_ok=True)
     if form == "npz":
-        np.savez(root / f"{name}.npz", allow_pickle=False, **dict(arrays))
+        np.savez(root / f"{name}.npz", **dict[str, Any](arrays))
     elif form == "hdf5":
         write_hdf5(root / f"{name}.h5", arrays)
     elif form == "zarr":

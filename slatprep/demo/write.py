@@ -119,11 +119,11 @@ def write_slat(
     for view in asset.views:
         stem = root / name / view.view if view.view else root / name
         stem.parent.mkdir(parents=True, exist_ok=True)
-        arrays: dict[str, NDArray[Any]] = {"coords": view.coords, "feats": view.feats}
+        arrays: dict[str, Any] = {"coords": view.coords, "feats": view.feats}
         if form == "npz-batch":
             arrays["coords"] = np.pad(view.coords.astype(np.int32), ((0, 0), (1, 0)))
         if form.startswith("npz"):
-            np.savez(stem.with_suffix(".npz"), allow_pickle=False, **arrays)
+            np.savez(stem.with_suffix(".npz"), **arrays)
         elif form == "hdf5":
             write_hdf5(stem.with_suffix(".h5"), arrays)
         else:
@@ -135,7 +135,7 @@ def write_truth(root: Path, asset: DemoAsset, source: Source) -> None:
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
         columns = columns_of(source, view.material, view.properties)
-        truth: dict[str, NDArray[Any]] = {
+        truth: dict[str, Any] = {
             "transform": view.transform,
             "material": view.material,
             "properties": np.stack(list(columns.values()), axis=1),
@@ -147,7 +147,7 @@ def write_truth(root: Path, asset: DemoAsset, source: Source) -> None:
         if view.places is not None:
             truth["places"] = view.places
         path = root / f"{row_id(asset, view)}.npz"
-        np.savez(path, allow_pickle=False, **truth)
+        np.savez(path, **truth)
 
 
 SPREAD = np.array([0.03, 0.15, 0.02])

@@ -93,7 +93,8 @@ def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]
 def _stem(asset_id: str) -> str:
     """Return a name for an asset's file that pandas reads as the same text."""
     name = file_name(asset_id)
-    if name.isdecimal() and len(name) < 19 and name == str(int(name)):  # It survives as int64.
+    whole = name.removeprefix("-").isdecimal()
+    if whole and len(name) < 19 and name == str(int(name)):  # It survives as int64.
         return name
     encoded = f"%{ord(name[0]):02X}{name[1:]}"
     try:

@@ -15,7 +15,7 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     The outside of the grid counts as empty. They are the source points of the alignment in
     SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
     """
-    padded = np.pad(np.asarray(occupancy, dtype=bool), 1)
+    padded = np.pad(np.ascontiguousarray(occupancy, dtype=bool), 1)
     # In a flattened grid a neighbour is so many places on, which numpy looks at far faster.
     flat = padded.reshape(-1)
     buried = flat.copy()

@@ -201,7 +201,7 @@ def compare_stores(
         what=dict(sorted(total.what.items())),
         verdicts=dict(sorted(total.verdicts.items())),
         moved=float(np.median(moved)),
-        moved_most=max(moved),
+        moved_most=float(np.max(moved)),
         voxels=total.voxels,
         labels=total.labels,
         properties=total.properties,

@@ -260,7 +260,8 @@ def verdict_of(
     limits = THRESHOLDS
     reasons: list[str] = []
     if math.isnan(same_object * right_placement):
-        failed = min(quality.fitness, quality.fitness_backward) < limits.failed_fitness
+        fitnesses = quality.fitness, quality.fitness_backward
+        failed = any(fitness < limits.failed_fitness for fitness in fitnesses)
         reasons += _low_fitness(quality)
     else:
         # Among placements that tie nobody has chosen yet: any of them may be right.

@@ -103,10 +103,10 @@ FACTORS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "kg/m^3": 1.0, "g/cm^3
 
 
 def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
-    """Return values of any shape in SI units; those without a known unit stay as they are."""
+    """Return values of any shape in SI units; those of unit ``1`` stay as they are."""
     given = np.asarray(values, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        si = 10.0**given if unit.startswith(LOG10) else given * FACTORS.get(unit, 1.0)
+        si = 10.0**given if unit.startswith(LOG10) else given * ({"1": 1.0} | FACTORS)[unit]
     return np.asarray(si)
 
 

@@ -12,7 +12,7 @@ from typing import IO, Self
 from slatprep.errors import ConfigError, InputError
 from slatprep.storage.archives import Archive, Index, shown
 from slatprep.storage.files import RemoteListing
-from slatprep.storage.remote import PlaceByText
+from slatprep.storage.remote import PlaceByText, RemotePlace
 from slatprep.storage.states import Noted
 from slatprep.storage.tar import BLOCK, MAX_KEPT, Entry
 
@@ -40,7 +40,7 @@ class ArchiveTree:
 
     @cached_property
     def indexes(self) -> dict[Archive, Index]:
-        """What each archive holds; several are read at the same time.
+        """What each archive holds; those of an object store are read at the same time.
 
         OSError if one cannot be read. What was found by then is kept.
         """
@@ -53,8 +53,14 @@ class ArchiveTree:
 
             return archive.index(tell)
 
+        # Local ones one by one here: who stops a scan waits for none of them.
+        remote = [archive for archive in self.archives if isinstance(archive.place, RemotePlace)]
         with ThreadPoolExecutor(_AT_ONCE) as pool:
-            return dict(zip(self.archives, pool.map(index, self.archives), strict=True))
+            coming = {archive: pool.submit(index, archive) for archive in remote}
+            return {
+                archive: coming[archive].result() if archive in coming else index(archive)
+                for archive in self.archives
+            }
 
     @cached_property
     def members(self) -> dict[str, tuple[Archive, Entry]]:

@@ -194,7 +194,7 @@ _SETTINGS: dict[str, Any] = {
 """Configurations of codecs, see `_has_form`; those of others are empty."""
 
 
-_GATE: dict[str, Any] = {"zarr_format": 3, "attributes": (dict, None)}
+_GATE: dict[str, Any] = {"zarr_format": 3, "attributes": dict}
 _ARRAY_GATE: dict[str, Any] = {
     "storage_transformers": (None, []),
     "data_type": DATA_TYPES,
@@ -210,7 +210,7 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
         what = "is no array or group of a store"
         yield Finding(where, "", what, "those that docs/formats.md has")
         return
-    yield from _misformed(where, metadata, _GATE)
+    yield from _misformed(where, {"attributes": {}, **metadata}, _GATE)
     if kind == "group":
         # zarr-python would take arrays from here that nobody has looked at.
         nested = metadata.get("consolidated_metadata")
@@ -269,7 +269,9 @@ def _in_words(form: Any) -> str:
         return f"{form[0]} to {form[-1]}"
     if isinstance(form, tuple):
         return " or ".join(map(_in_words, form))
-    return form.__name__ if isinstance(form, type) else repr(form)
+    words = ((list[str], "a name for each dimension"), (dict, "a JSON object"), (None, "none"))
+    told = [word for one, word in words if form == one]
+    return told[0] if told else form.__name__ if isinstance(form, type) else repr(form)
 
 
 def _codecs(codecs: Any) -> Iterator[Mapping[str, Any]]:

@@ -202,7 +202,9 @@ def _json(content: Mapping[str, Any]) -> str:
 
 
 def _block(file: TextIO, name: str, kind: str, text: str) -> None:
-    """Write a block of data, which browsers do not execute; no text may hold ``</script``."""
+    """Write a block of data, which browsers do not execute."""
+    if "</script" in text.lower() or "<!--" in text:
+        raise ValueError(f"the block {name} would end before its end")
     file.write(f'<script type="{kind}" id="{name}">{text}</script>\n')
 
 

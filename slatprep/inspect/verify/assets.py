@@ -67,6 +67,7 @@ def asset_findings(
         if sound:  # From invalid values no confidence can be computed.
             findings += confidence_findings(asset, record)
         if roots is not None:
+            where, expected = "sources", "those that the store was made from"
             changed, compared = list(source_findings(record, roots, source)), len(record.sources)
             findings += changed
             if record.merged and sound and not changed:
@@ -82,6 +83,9 @@ def asset_findings(
 
 def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     """Yield findings on values that the contract does not allow."""
+    if not len(asset.coords):
+        yield Finding("asset/offset", asset.asset_id, "no voxels", "one or more")
+        return
     valid, material, grid, votes = asset.valid, asset.material, asset.grid_material, asset.votes
     contents, likely = asset.store.contents, asset.confidence
     classes, empty = contents.n_labels, contents.background
