@@ -15,6 +15,7 @@ import pytest
 from support.synthetic import JELLY, METAL, QUARTER_TURN, Asset, make_asset
 
 import slatprep
+from slatprep.errors import ConfigError, needing
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import Engine
 
@@ -160,3 +161,9 @@ def test_type_checkers_see_the_package_from_outside_the_checkout(tmp_path):
     seen = re.findall(r'Revealed type is "([\w.\[\]]+)"', done.stdout)
     asset = "slatprep.store.reader.StoredAsset"
     assert seen == ["slatprep.store.reader.Store", asset, f"list[{asset}]"], done.stdout
+
+
+def test_a_package_that_fails_while_it_is_imported_tells_why():
+    reason = r"reading a PLY needs a package that fails \(for another numpy\); install it with"
+    with pytest.raises(ConfigError, match=reason), needing("reading a PLY needs", "simulate"):
+        raise ImportError("for another numpy")

@@ -105,6 +105,7 @@ EDITS: list[tuple[str, Any, str]] = [
     ("dimension_names", [5], r"dimension_names is \[5\]"),
     ("node_type", "other", "is no array or group"),
     ("attributes", 5, "attributes is 5"),
+    ("attributes", None, "attributes is None"),
     ("storage_transformers", [{"name": "x"}], "storage_transformers is"),
 ]
 

@@ -155,7 +155,7 @@ def _voxel_findings(
     asset: StoredAsset, where: str, fine: NDArray[np.bool_], expected: str
 ) -> Iterator[Finding]:
     """Yield a finding unless all values (N, ...) of the voxels are fine; comparisons refuse NaN."""
-    wrong = np.count_nonzero(~fine.reshape(len(fine), -1).all(axis=1))
+    wrong = np.count_nonzero(~fine.all(axis=tuple(range(1, fine.ndim))))
     if wrong:
         yield Finding(where, asset.asset_id, f"{wrong} of {len(fine)} voxels differ", expected)
 

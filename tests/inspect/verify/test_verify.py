@@ -172,6 +172,12 @@ def test_values_out_of_the_contract_are_found(store, faults):
         assert any(what in finding.what for finding in told), (array, what, findings)
 
 
+def test_an_asset_without_voxels_is_found(store):
+    rewrite(store, "asset/offset", 1, 0)
+    told = {finding.what for finding in found(store) if finding.asset == open_store(store).ids[0]}
+    assert "no voxels" in told
+
+
 def test_a_voxel_that_is_not_valid_but_labelled_is_found(store):
     rewrite(store, "voxel/valid", 4, False)
     files = {finding.file for finding in found(store) if finding.asset == "ant"}
