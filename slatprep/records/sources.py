@@ -102,11 +102,14 @@ FACTORS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "kg/m^3": 1.0, "g/cm^3
 """What a value in a unit is multiplied by to be in SI units."""
 
 
+_FACTOR = {"": 1.0, "1": 1.0} | FACTORS
+
+
 def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
-    """Return values of any shape in SI units; those of unit ``1`` stay as they are."""
+    """Return values of any shape in SI units; those of unit ``1``, or of none, stay as they are."""
     given = np.asarray(values, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        si = 10.0**given if unit.startswith(LOG10) else given * ({"1": 1.0} | FACTORS)[unit]
+        si = 10.0**given if unit.startswith(LOG10) else given * _FACTOR[unit]
     return np.asarray(si)
 
 

@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.special import logit
-from support.shapes import GRID, Case, chair, field_of, surface_latents
+from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
 from slatprep.align.figures import measure_figures
 from slatprep.demo import make_demo
 from slatprep.geometry.deformation import map_of
-from slatprep.inspect.score import read_truth
+from slatprep.inspect.score import Truth, read_truth
 from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, judge, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
@@ -52,6 +52,7 @@ from slatprep.records import (
 )
 from slatprep.sample import sample
 
+Case = tuple[MaterialField, StructuredLatents, Truth]
 OF_PLACEMENT = ("margin", "clear_by", "ties", "alike")
 
 
