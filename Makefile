@@ -113,7 +113,7 @@ docs: $(VENV)/.installed-dev
 	@echo "documentation: $(SITE)/index.html"
 
 schema: $(VENV)/.installed-dev
-	$(BIN)/python -m slatprep.store.record_json
+	$(BIN)/python tools/schema.py
 
 wheel: $(VENV)/.installed-dev
 	$(WHEEL)

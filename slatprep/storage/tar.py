@@ -14,7 +14,7 @@ import tarfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import IO, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 
 class Ranges(Protocol):
@@ -168,6 +168,9 @@ BLOCK = tarfile.BLOCKSIZE
 MAX_KEPT = 2**27
 """Bytes of a member that is kept; no reader takes a larger file."""
 
+_STREAMED = 2**23
+"""Bytes that an archive with gzip is read by."""
+
 INCOMPLETE = "download it again"
 
 
@@ -223,13 +226,14 @@ def entries(
 
 
 def unpack(
-    stream: IO[bytes], wanted: Callable[[str], bool], keep: Callable[[Entry, bytes], None]
-) -> Iterator[Entry]:
-    """Yield the members of an archive with gzip, read once from its beginning.
+    file: io.RawIOBase, wanted: Callable[[str], bool], keep: Callable[[Entry, bytes], None]
+) -> Iterator[tuple[Entry | None, int]]:
+    """Yield what `entries` does of an archive with gzip, read once from its beginning.
 
-    `keep` gets the data of names that are `wanted`, but for those larger than `MAX_KEPT`.
-    ArchiveError where the archive is damaged or ends too early.
+    Each comes with the bytes of the file that were read. `keep` gets the data of names that are
+    `wanted`, but for those larger than `MAX_KEPT`.
     """
+    stream = io.BufferedReader(file, _STREAMED)
     with _told(), tarfile.open(fileobj=stream, mode="r|gz", errors="surrogateescape") as archive:
         for member in archive:
             entry = _entry(member, 0)
@@ -244,7 +248,7 @@ def unpack(
                 if len(content) != member.size:
                     raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
                 keep(entry, content)
-            yield entry
+            yield entry, file.tell()
 
 
 def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:

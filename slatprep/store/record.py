@@ -3,7 +3,7 @@
 They are written and read by `slatprep.store.record_json`, and nowhere
 else. A record that is read is checked: unknown keys, types, ranges and
 digests. ``slatprep/store/schema`` holds the JSON Schemas, which
-`slatprep.store.record_json` makes from these classes.
+``tools/schema.py`` makes from these classes.
 """
 
 from __future__ import annotations

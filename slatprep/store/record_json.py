@@ -1,19 +1,16 @@
 """Records as JSON, written and read with bounds, and as columns, in this one place.
 
-    python -m slatprep.store.record_json
-
-writes their JSON Schemas into ``slatprep/store/schema``, where they are published.
+Their JSON Schemas lie in `FOLDER`, where they are published; ``tools/schema.py`` writes them.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import orjson
@@ -27,6 +24,8 @@ from slatprep.store.record import AssetRecord, BuildRecord, Record
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
 
+
+FOLDER = Path(__file__).with_name("schema")
 
 _FAULTS = 64
 _Kind = TypeVar("_Kind")
@@ -164,26 +163,3 @@ def columns_of(record: AssetRecord) -> dict[str, Any]:
     }
     names = (layout.name.removeprefix("asset/") for layout in ARRAYS)
     return {name: entries[name] for name in names if name in entries}
-
-
-FOLDER = Path(__file__).with_name("schema")
-
-
-def json_schemas() -> dict[str, dict[str, Any]]:
-    """Return the JSON Schema (draft 2020-12) of each kind of record, by its file's name."""
-    from pydantic import Field
-
-    dialect = "https://json-schema.org/draft/2020-12/schema"
-    kinds = {"asset": Annotated[Record, Field(discriminator="status")], "build": BuildRecord}
-    schemas: dict[str, dict[str, Any]] = {}
-    for name, kind in kinds.items():
-        title = f"slatprep {name} record"
-        schema = {"$schema": dialect, **adapter_of(kind).json_schema(), "title": title}
-        # Defaults may be tuples.
-        schemas[f"{name}_record.schema.json"] = json.loads(json.dumps(schema))
-    return schemas
-
-
-if __name__ == "__main__":
-    for name, schema in json_schemas().items():
-        (FOLDER / name).write_text(json.dumps(schema, indent=2) + "\n", encoding="utf-8")

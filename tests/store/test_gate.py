@@ -19,7 +19,7 @@ import pytest
 import zarr
 from google_crc32c import value as crc32c
 from support.commands import refused, run
-from support.made_store import edit_json
+from support.made_store import edit_json, placed
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import verify_store
@@ -249,17 +249,6 @@ del store
     assert "ResourceWarning" not in told.stderr
 
 
-def edited(text: str, change: dict[str, object]) -> str:
-    document = json.loads(text)
-    for place, value in change.items():
-        target = document[META]["metadata"]
-        *keys, last = place.split("|")
-        for key in keys:
-            target = target[int(key) if key.isdigit() else key]
-        target[int(last) if last.isdigit() else last] = value
-    return json.dumps(document)
-
-
 FEATS = "voxel/feats|"
 SHARDING = "codecs|0|configuration|"
 
@@ -311,7 +300,12 @@ for case, document in json.loads(sys.stdin.read()).items():
 
 def test_hostile_metadata_cost_neither_memory_nor_sense(copy):
     sound = (copy / "zarr.json").read_text()
-    documents = {case: edited(sound, change) for case, change in HOSTILE.items()}
+    documents = {}
+    for case, changes in HOSTILE.items():
+        document = json.loads(sound)
+        for place, value in changes.items():
+            document = placed(document, f"{META}|metadata|{place}", value, by="|")
+        documents[case] = json.dumps(document)
     done = subprocess.run(
         [sys.executable, "-c", HOSTILE_READER, str(copy)],
         input=json.dumps(documents), capture_output=True, text=True, check=True,

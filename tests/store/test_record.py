@@ -2,14 +2,16 @@
 
 import hashlib
 import json
+import runpy
 from dataclasses import replace
 from math import nan
+from pathlib import Path
 from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
-from support.made_store import BUILD_ID
+from support.made_store import BUILD_ID, GONE, placed
 
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.records import PIXIEVERSE, LatentSpace, Property
@@ -25,7 +27,6 @@ from slatprep.store.record_json import (
     FOLDER,
     RecordError,
     adapter_of,
-    json_schemas,
     read_asset_record,
     read_build_record,
     to_json,
@@ -63,8 +64,9 @@ def test_every_record_follows_the_published_schema(mixed_build):
 
 
 def test_the_published_schemas_are_those_of_the_classes():
-    """Made anew by ``python -m slatprep.store.record_json``."""
-    assert json_schemas() == {path.name: json.loads(path.read_text()) for path in FOLDER.iterdir()}
+    """Made anew by ``make schema``."""
+    made = runpy.run_path(str(Path(__file__).parents[2] / "tools" / "schema.py"))["json_schemas"]()
+    assert made == {path.name: json.loads(path.read_text()) for path in FOLDER.iterdir()}
 
 
 def test_what_is_written_is_read_again_bit_for_bit(mixed_build):
@@ -77,31 +79,17 @@ def test_what_is_written_is_read_again_bit_for_bit(mixed_build):
     assert to_json(build, indent=True) + b"\n" == file.read_bytes()
 
 
-def place(document: dict, path: str, value: object) -> dict:
-    """Return a document with the value at ``a/0/b`` replaced; None removes it."""
-    changed = json.loads(json.dumps(document))
-    *steps, last = [int(step) if step.isdigit() else step for step in path.split("/")]
-    at = changed
-    for step in steps:
-        at = at[step]
-    if value is None:
-        del at[last]
-    else:
-        at[last] = value
-    return changed
-
-
 @pytest.mark.parametrize(
     ("path", "value"),
     [
         ("status", "fine"),
         ("status", "failed"),
-        ("status", None),
+        ("status", GONE),
         ("format_version", 2),
         ("asset_id", ""),
-        ("alignment", None),
+        ("alignment", GONE),
         ("alignment/engine", "magic"),
-        ("alignment/transform/3", None),
+        ("alignment/transform/3", GONE),
         ("alignment/transform/0/0", "1"),
         ("alignment/quality/fitness", 1.5),
         ("alignment/quality/fitness", -0.1),
@@ -115,8 +103,8 @@ def place(document: dict, path: str, value: object) -> dict:
         ("parameters/align/radius", "1"),
         ("parameters/sample/surplus", 1),
         ("counts/valid", -1),
-        ("versions", None),
-        ("versions/numpy", None),
+        ("versions", GONE),
+        ("versions/numpy", GONE),
         ("code", "0" * 63),
         ("key", ""),
         ("surplus", 1),
@@ -124,12 +112,12 @@ def place(document: dict, path: str, value: object) -> dict:
 )
 def test_what_is_no_record_is_refused_and_named(record, path, value):
     document = json.loads(to_json(record))
-    changed = place(document, path, value)
+    changed = placed(document, path, value)
     with pytest.raises(RecordError, match=r"^a\.jsonl, line 3: not a record") as refused:
         read_asset_record(json.dumps(changed), "a.jsonl, line 3")
     assert refused.value.faults[0].startswith(path.rpartition("/")[0])
     if path != "versions/numpy":  # That certain keys must be there, JSON Schema cannot say.
-        schema = json_schemas()["asset_record.schema.json"]
+        schema = json.loads((FOLDER / "asset_record.schema.json").read_text())
         assert not jsonschema.Draft202012Validator(schema).is_valid(changed)
 
 
@@ -263,16 +251,16 @@ SAME = "property_columns and normalization must name the same properties"
         ("property_columns", ["density", "taste"], " is {", SAME),
         ("property_units", ["1"], " is {", "property_units must have a unit for each of"),
         ("manifest", LONG, f"manifest is '{LONG[:99]}", ""),
-        ("manifest", None, "manifest is missing", ""),
-        ("build/versions", None, "build/versions is missing", ""),
-        ("build/parameters", None, "build/parameters is missing", ""),
+        ("manifest", GONE, "manifest is missing", ""),
+        ("build/versions", GONE, "build/versions is missing", ""),
+        ("build/parameters", GONE, "build/parameters is missing", ""),
         ("build/parameters", 5, "build/parameters is 5", ""),
         ("build/parameters", {"sample": 5}, "build/parameters", ""),
         ("build/parameters", {"sample": None}, "build/parameters", ""),
     ],
 )
 def test_what_is_wrong_is_told_by_its_name(path, value, what, expected):
-    found = read_attributes(place(said(), path, value))
+    found = read_attributes(placed(said(), path, value))
     assert isinstance(found, tuple)
     assert len(found) == 1 or path == "build/parameters"
     for finding in found:
@@ -283,7 +271,7 @@ def test_what_is_wrong_is_told_by_its_name(path, value, what, expected):
 
 
 def test_every_fault_is_told():
-    found = read_attributes(place(place(said(), "manifest", None), "resolution", 32))
+    found = read_attributes(placed(placed(said(), "manifest", GONE), "resolution", 32))
     told = {"attribute manifest is missing", "attribute resolution is 32"}
     assert {one.what for one in found} == told
 

@@ -86,6 +86,21 @@ def edit_record(store: Path, row: int, edit: Callable[[dict[str, Any]], object])
     group["asset/record"][row] = json.dumps(record)
 
 
+GONE = object()
+
+
+def placed(document: dict[str, Any], path: str, value: object, by: str = "/") -> dict[str, Any]:
+    """Return a document with the value at ``a/0/b`` replaced, or removed by `GONE`."""
+    whole = at = json.loads(json.dumps(document))
+    *steps, last = (int(step) if step.isdigit() else step for step in path.split(by))
+    for step in steps:
+        at = at[step]
+    at[last] = value
+    if value is GONE:
+        del at[last]
+    return whole
+
+
 def edit_json(path: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     """Change a JSON file in place."""
     document = json.loads(path.read_text())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.commands import document, refused, run
 from support.faults import flip
-from support.made_store import edit_json, edit_record, rewrite
+from support.made_store import edit_json, edit_record, placed, rewrite
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import Finding, SourceRoots, index_findings, verify_store
@@ -338,15 +338,11 @@ OF_THE_STORE: list[tuple[str, object]] = [
 
 def test_what_build_json_says_of_the_store_is_compared(store):
     build, opened = store.with_suffix(".manifests") / "build.json", open_store(store)
-    sound = build.read_text()
+    sound = json.loads(build.read_text())
     for entry, value in OF_THE_STORE:
-        *steps, last = (int(step) if step.isdigit() else step for step in entry.split("/"))
-        document = whole = json.loads(sound)
-        for step in steps:
-            document = document[step]
-        assert document[last] != value
-        document[last] = value
-        build.write_text(json.dumps(whole))
+        changed = placed(sound, entry, value)
+        assert changed != sound
+        build.write_text(json.dumps(changed))
         assert [one.file for one in manifest_findings(opened, build.parent)] == [str(build)], entry
 
 
