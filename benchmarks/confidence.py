@@ -279,17 +279,7 @@ def _row(kind: str, asset: Asset, owner: Asset, alignment: Alignment) -> Row:
     annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
     around = surroundings_of(field, latents, alignment, annotation)
     ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
-    score = compare_with_truth(
-        asset_id,
-        truth,
-        centres=latents.centres,
-        transform=alignment.transform,
-        material=annotation.material,
-        valid=annotation.valid,
-        annotated=field.voxels,
-        annotated_material=field.material,
-        places=annotation.place,
-    )
+    score = compare_with_truth(asset_id, truth, field, latents, annotation)
     valid = np.flatnonzero(annotation.valid)
     chosen = valid[np.linspace(0, len(valid) - 1, min(VOXELS, len(valid))).astype(np.intp)]
     columns = (

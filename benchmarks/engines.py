@@ -35,7 +35,6 @@ from slatprep.cli.signature import Click, command
 from slatprep.demo import make_demo
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.geometry.deformation import map_of
-from slatprep.geometry.frames import nearest_similarity
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.inspect.score import LevelScore, TruthScore, compare_with_truth, read_truth, summarise
 from slatprep.parameters import PRESETS, AlignParameters
@@ -179,21 +178,11 @@ def bench_align(
                     surface_of(occupancy_of(latents.coords, latents.resolution))
                 for position, engine in enumerate(chosen):
                     with _timed(seconds[engine]):
-                        transform, places = _align(engine, field, latents)
+                        places = _align(engine, field, latents)
                     if repeat == 0:
                         preset = PRESETS["default" if engine == REFERENCE else "paper"]
                         annotation = sample(field, places, preset.sample)
-                        score = compare_with_truth(
-                            pair.asset_id,
-                            truth,
-                            centres=latents.centres,
-                            transform=transform,
-                            places=places,
-                            material=annotation.material,
-                            valid=annotation.valid,
-                            annotated=field.voxels,
-                            annotated_material=field.material,
-                        )
+                        score = compare_with_truth(pair.asset_id, truth, field, latents, annotation)
                         scores[engine].append(score)
                     if progress:
                         done = (number * repeats + repeat) * len(chosen) + position + 1
@@ -256,17 +245,13 @@ def pairs_with_truth(folder: Path, limit: int | None = None) -> Iterator[tuple[A
         yield from islice(found, limit)
 
 
-def _align(
-    engine: str, field: MaterialField, latents: StructuredLatents
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the similarity (4, 4) of an engine's map, and where it leads the voxels (N, 3)."""
+def _align(engine: str, field: MaterialField, latents: StructuredLatents) -> NDArray[np.float64]:
+    """Return where an engine's map leads the SLAT's voxels, (N, 3) in the PixieVerse frame."""
     if engine.startswith("cpd-"):
         from cpd import cpd_places
 
-        places = cpd_places(field, latents, deformable=engine == "cpd-deformable")
-        return nearest_similarity(places, latents.centres), places
-    alignment = _aligned(engine, field, latents)
-    return alignment.transform, map_of(alignment).to_pixieverse(latents.centres)
+        return cpd_places(field, latents, deformable=engine == "cpd-deformable")
+    return map_of(_aligned(engine, field, latents)).to_pixieverse(latents.centres)
 
 
 def _aligned(engine: str, field: MaterialField, latents: StructuredLatents) -> Alignment:

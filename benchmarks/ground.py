@@ -252,11 +252,7 @@ def _row(asset: Asset, owner: Asset, kind: str) -> Row:
     verdict = str(judge(field, latents, found, annotation, parameters)[0].verdict)
     if owner is not asset:
         return Row(kind, True, None, verdict)
-    score = compare_with_truth(
-        asset.truth.name, asset.truth, centres=latents.centres, transform=found.transform,
-        material=annotation.material, valid=annotation.valid, annotated=field.voxels,
-        annotated_material=field.material, places=annotation.place,
-    )  # fmt: skip
+    score = compare_with_truth(asset.truth.name, asset.truth, field, latents, annotation)
     return Row(kind, False, score, verdict)
 
 

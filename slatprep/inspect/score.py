@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from slatprep.errors import InputError
 from slatprep.geometry.frames import VOXEL_SIZE, apply_transform, invert_transform, voxel_centres
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
-from slatprep.records import MAX_PROPERTIES, Place
+from slatprep.records import (
+    MAX_PROPERTIES,
+    Annotation,
+    MaterialField,
+    Place,
+    StructuredLatents,
+)
 from slatprep.store import StoredAsset, open_store
 from slatprep.workers import Progress
 
@@ -187,8 +193,9 @@ def _summarise_level(level: int, scores: Sequence[TruthScore]) -> LevelScore:
 
 def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
     truth, field = read_truth(path), asset.field
-    material: NDArray[np.integer[Any]] = asset.material
-    annotated_material: NDArray[np.integer[Any]] = field.material
+    annotation = Annotation(
+        asset.properties_si, asset.material, asset.valid, asset.distance, asset.place
+    )
     if not field.classified:
         names, values = _true_values(path, len(truth.material))
         known, labels = np.unique(values, axis=0, return_inverse=True)
@@ -197,19 +204,10 @@ def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
             raise InputError(path, what, f"at most {MOST_VALUES}")
         columns = asset.store.columns_of(names)
         truth = replace(truth, material=labels.reshape(-1))
-        material = _row_of(asset.properties_si[:, columns], known)
-        annotated_material = _row_of(field.properties[:, columns], known)
-    return compare_with_truth(
-        asset.asset_id,
-        truth,
-        centres=asset.latents.centres,
-        transform=asset.transform,
-        material=material,
-        valid=asset.valid,
-        annotated=field.voxels,
-        annotated_material=annotated_material,
-        places=asset.place,
-    )
+        field = replace(field, material=_row_of(field.properties[:, columns], known))
+        material = _row_of(annotation.properties[:, columns], known)
+        annotation = replace(annotation, material=material)
+    return compare_with_truth(asset.asset_id, truth, field, asset.latents, annotation)
 
 
 def _true_values(path: Path, count: int) -> tuple[tuple[str, ...], NDArray[np.floating[Any]]]:
@@ -222,11 +220,9 @@ def _true_values(path: Path, count: int) -> tuple[tuple[str, ...], NDArray[np.fl
     return names, values
 
 
-def _row_of(
-    values: NDArray[np.float32], known: NDArray[np.floating[Any]]
-) -> NDArray[np.integer[Any]]:
+def _row_of(values: NDArray[np.float32], known: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     """Return which of the known rows each row of values (N, P) is; as many as there are if none."""
-    found = np.full(len(values), len(known))
+    found = np.full(len(values), len(known), np.uint8)
     for number, row in enumerate(known):
         found[np.isclose(values, row, rtol=SAME_VALUE, atol=1e-6).all(axis=1)] = number
     return found
@@ -235,53 +231,43 @@ def _row_of(
 def compare_with_truth(
     asset_id: str,
     truth: Truth,
-    *,
-    centres: NDArray[np.float64],
-    transform: NDArray[np.float64],
-    material: NDArray[np.integer[Any]],
-    valid: NDArray[np.bool_],
-    annotated: NDArray[np.integer[Any]],
-    annotated_material: NDArray[np.integer[Any]],
-    places: NDArray[np.floating[Any]] | None = None,
+    field: MaterialField,
+    latents: StructuredLatents,
+    annotation: Annotation,
 ) -> TruthScore:
     """Compare one asset's places and labels with its truth.
 
-    `centres` (N, 3) of the SLAT voxels, the estimated `transform` (4, 4), and `material` and
-    `valid` (N,) are the asset's; `annotated` (K, 3) are voxels of the PixieVerse frame with their
-    classes (K,). Voxels were looked up at `places` (N, 3) in that frame's unit cube, by default
-    where the inverse of `transform` puts them. InputError if the truth does not have one class and
-    one place for each voxel.
+    InputError if the truth does not have one class and one place for each voxel.
     """
     from scipy.spatial import cKDTree
 
-    by_similarity = apply_transform(invert_transform(truth.transform), centres)
+    by_similarity = apply_transform(invert_transform(truth.transform), latents.centres)
     true_places = by_similarity if truth.places is None else truth.places
     for name, kind, found, shape in (
-        ("material", "class", truth.material, material.shape),
+        ("material", "class", truth.material, annotation.material.shape),
         ("places", "place", true_places, by_similarity.shape),
     ):
         if found.shape != shape:
             wanted = f"{shape}, one {kind} for each SLAT voxel of the asset"
             raise InputError(truth.path, f"{name} has shape {found.shape}", wanted)
-    if places is None:
-        places = apply_transform(invert_transform(transform), centres)
-    tree = cKDTree(voxel_centres(annotated))
+    tree = cKDTree(voxel_centres(field.voxels))
     distance, nearest = tree.query(true_places)
     answerable = distance / VOXEL_SIZE <= ANSWERABLE_DISTANCE
+    labelled_right = (annotation.material == truth.material) & annotation.valid
     similarity_nearest = nearest if truth.places is None else tree.query(by_similarity)[1]
 
     def right(chosen: NDArray[np.intp]) -> float:
-        return _share((annotated_material[chosen] == truth.material)[answerable])
+        return _share((field.material[chosen] == truth.material)[answerable])
 
     return TruthScore(
         asset_id=asset_id,
         name=truth.name,
         level=truth.level,
         symmetric=truth.symmetric,
-        displacement=_mean_distance(places, true_places),
-        label_accuracy=_share(((material == truth.material) & valid)[answerable]),
+        displacement=_mean_distance(annotation.place, true_places),
+        label_accuracy=_share(labelled_right[answerable]),
         truth_own=right(nearest),
-        valid_share=_share(valid),
+        valid_share=_share(annotation.valid),
         similarity_displacement=_mean_distance(by_similarity, true_places),
         similarity_accuracy=right(similarity_nearest),
     )

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from support.commands import document, run
 from support.made_store import rewrite
+from support.shapes import GRID, annotated, field_of, latents_of
 
 from slatprep.errors import InputError
-from slatprep.geometry.frames import make_transform
+from slatprep.geometry.frames import make_transform, places_of
+from slatprep.geometry.voxels import occupancy_of
 from slatprep.inspect.score import (
     Truth,
     TruthScore,
@@ -17,25 +19,28 @@ from slatprep.inspect.score import (
     score_against_truth,
     summarise,
 )
+from slatprep.records import MaterialField
 from slatprep.store import open_store
 
 # A rod of two materials along x in the PixieVerse frame.
 ROD = np.array([[x, 32, 32] for x in range(20, 40)])
 ROD_MATERIAL = np.where(ROD[:, 0] < 30, 1, 5).astype(np.uint8)
 TRUTH = Truth(Path("a.npz"), np.eye(4), ROD_MATERIAL, "rod", 1, False)
+FIELD = field_of(occupancy_of(ROD), np.where(GRID[..., 0] < 30, 1, 5))
 
 
-def scored(truth: Truth = TRUTH, coords: np.ndarray = ROD, **asset: np.ndarray) -> TruthScore:
-    """Score a rod whose voxels are the SLAT's, but for what is said of the asset."""
-    usual = {
-        "centres": (coords + 0.5) / 64 - 0.5,
-        "transform": np.eye(4),
-        "material": truth.material,
-        "valid": np.ones(len(coords), dtype=bool),
-        "annotated": ROD,
-        "annotated_material": ROD_MATERIAL,
-    }
-    return compare_with_truth("a", truth, **(usual | asset))
+def scored(
+    truth: Truth = TRUTH,
+    coords: np.ndarray = ROD,
+    transform: np.ndarray | None = None,
+    field: MaterialField = FIELD,
+    **of_annotation: np.ndarray,
+) -> TruthScore:
+    """Score a rod whose voxels are the SLAT's and labelled right, but for what is said of it."""
+    latents = latents_of(coords)
+    places = places_of(latents.centres, np.eye(4) if transform is None else transform)
+    annotation = replace(annotated(truth.material, places), **of_annotation)
+    return compare_with_truth("a", truth, field, latents, annotation)
 
 
 def test_displacement_is_measured_in_the_pixieverse_frame():
@@ -71,7 +76,8 @@ def test_voxels_without_an_answer_are_not_asked():
 
 
 def test_unannotated_voxels_are_no_answer():
-    score = scored(annotated=ROD[6:], annotated_material=ROD_MATERIAL[6:])
+    rest = replace(FIELD, voxels=FIELD.voxels[6:], material=ROD_MATERIAL[6:])
+    score = scored(field=rest)
     assert score.truth_own == 1.0  # x = 24, 25 ask their neighbour at 26; the rest is not asked
 
 
@@ -115,7 +121,7 @@ def test_displacement_is_from_the_true_places():
     assert score.displacement == pytest.approx(apart.mean())
     moved = np.abs(long[:, 0] + 0.5 - 5 - (long[:, 0] + 0.5) / 2 - 15)
     assert score.similarity_displacement == pytest.approx(moved.mean())
-    aside = scored(truth, long, places=np.add(places, [0.0, 1 / 64, 0.0]))
+    aside = scored(truth, long, place=np.add(places, [0.0, 1 / 64, 0.0]))
     assert aside.displacement == pytest.approx(1.0)
 
 
