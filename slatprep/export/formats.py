@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -16,7 +17,6 @@ from slatprep.errors import ConfigError, StoreError
 from slatprep.geometry.frames import voxel_centres
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, Verdict
 from slatprep.store import Store, StoredAsset
-from slatprep.store.layout import MERGED_COLUMNS
 from slatprep.store.records import StoredRecords
 
 Points = Literal["slat", "grid"]
@@ -42,11 +42,6 @@ class Exported(NamedTuple):
     file: str
     points: int
     figures: Mapping[str, float] = MappingProxyType({})
-
-
-def with_merged(store: Store, *names: str) -> tuple[str, ...]:
-    """Return names of an asset's arrays, and those of merged labels where the store has them."""
-    return (*names, *MERGED_COLUMNS) if store.merges else names
 
 
 def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str]) -> list[str]:
@@ -178,3 +173,17 @@ class Writer:
     finish: Callable[[Path, Sequence[dict[str, Any]]], Sequence[str]] | None = None
     remarks: Callable[[Sequence[dict[str, Any]]], tuple[str, ...]] = lambda _entries: ()
     is_export: Callable[[Path], bool] | None = None
+
+
+def one_by_one(write: Callable[[Path, StoredAsset], Exported], **more: Any) -> Writer:
+    """Return the writer of a file for each asset, which `write` puts into a folder."""
+    return Writer(partial(_write_each, write), **more)
+
+
+def _write_each(
+    write: Callable[[Path, StoredAsset], Exported],
+    directory: Path,
+    _number: int,
+    assets: Iterable[StoredAsset],
+) -> Iterator[Exported]:
+    return (write(directory, asset) for asset in assets)

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
 from slatprep.export.formats import (
@@ -30,10 +31,11 @@ from slatprep.export.formats import (
     Writer,
     annotated_points,
     describe_columns,
-    with_merged,
+    one_by_one,
 )
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
+from slatprep.store.layout import MERGED_COLUMNS
 
 METADATA = "metadata.csv"
 
@@ -51,28 +53,36 @@ def trellis(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
         raise ConfigError(
             f"latent_model is {model!r}; expected an encoder's name, of letters, digits, . _ and -"
         )
-    return Writer(partial(write_latents, model), finish=partial(write_metadata, model))
+    return one_by_one(partial(write_latents, model), finish=partial(write_metadata, model))
 
 
-def write_latents(
-    model: str, directory: Path, number: int, assets: Iterable[StoredAsset]
-) -> Iterator[Exported]:
-    """Write an npz for each asset: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
+def write_latents(model: str, directory: Path, asset: StoredAsset) -> Exported:
+    """Write an asset's npz: TRELLIS's ``coords`` and ``feats``, and the `TARGETS`.
 
-    `model` is the encoder's name, which names the folder; `number` has no use here.
+    `model` is the encoder's name, which names the folder.
     """
-    folder = PurePosixPath("latents", model)
-    (directory / folder).mkdir(parents=True, exist_ok=True)
-    for asset in assets:
-        name = str(folder / f"{_stem(asset.asset_id)}.npz")
-        names = with_merged(asset.store, "coords", *TARGETS)
-        arrays = {key: getattr(asset, key) for key in names}
-        space = asset.store.contents.latents
-        arrays |= space.beside_voxels
-        # TRELLIS's dataset standardises the latents that it reads.
-        arrays["feats"] = space.as_encoded(asset.feats)
-        np.savez_compressed(directory / name, **arrays)
-        yield Exported(asset, name, len(asset.coords))
+    arrays = _arrays(asset, "coords", *TARGETS)
+    space = asset.store.contents.latents
+    arrays |= space.beside_voxels
+    # TRELLIS's dataset standardises the latents that it reads.
+    arrays["feats"] = space.as_encoded(asset.feats)
+    name = str(PurePosixPath("latents", model, f"{_stem(asset.asset_id)}.npz"))
+    return _write(directory, name, asset, len(asset.coords), arrays)
+
+
+def _arrays(asset: StoredAsset, *names: str) -> dict[str, NDArray[Any]]:
+    """Return arrays of an asset by name, and those of merged labels where the store has them."""
+    merged = MERGED_COLUMNS if asset.store.merges else ()
+    return {name: getattr(asset, name) for name in (*names, *merged)}
+
+
+def _write(
+    directory: Path, name: str, asset: StoredAsset, points: int, arrays: dict[str, NDArray[Any]]
+) -> Exported:
+    """Write arrays of an asset, compressed."""
+    (directory / name).parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(directory / name, **arrays)
+    return Exported(asset, name, points)
 
 
 def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
@@ -120,10 +130,10 @@ def write_shard(directory: Path, number: int, assets: Iterable[StoredAsset]) -> 
             key = file_name(asset.asset_id, dots=False)
             about = {**describe_columns(asset), "transform": asset.transform.tolist()}
             _add(tar, f"{key}.json", orjson.dumps(about))
-            names = with_merged(asset.store, "coords", "feats", *TARGETS, "distance", "place")
+            arrays = _arrays(asset, "coords", "feats", *TARGETS, "distance", "place")
             # Not compressed, since a training loop reads it repeatedly.
             packed = io.BytesIO()
-            np.savez(packed, **{name: getattr(asset, name) for name in names})
+            np.savez(packed, **arrays)
             _add(tar, f"{key}.npz", packed.getvalue())
             yield Exported(asset, shard, len(asset.coords))
 
@@ -149,23 +159,14 @@ FOLDER = "voxels"
 
 def voxel_data(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of an npz for each asset; see `slatprep.export.FORMATS`."""
-    return Writer(partial(write_voxels, points=options.points or "slat"))
+    return one_by_one(partial(write_voxels, options.points or "slat"))
 
 
-def write_voxels(
-    directory: Path, number: int, assets: Iterable[StoredAsset], *, points: Points
-) -> Iterator[Exported]:
-    """Write ``voxels/<id>_with_materials.npz`` of each asset, and yield what was written."""
-    (directory / FOLDER).mkdir(exist_ok=True)
-    for asset in assets:
-        there = annotated_points(asset, points)
-        rows = np.zeros(len(there.material), dtype=VOXEL)
-        for axis, name in enumerate("xyz"):
-            rows[name] = there.in_slat[:, axis]
-        solid = there.solid(asset)
-        for column, name in enumerate(("youngs_modulus", "density", "poissons_ratio")):
-            rows[name] = solid[:, column]
-        rows["segment_id"] = np.array(asset.store.contents.labels, dtype="<U32")[there.material]
-        name = f"{FOLDER}/{file_name(asset.asset_id)}_with_materials.npz"
-        np.savez_compressed(directory / name, voxel_data=rows)
-        yield Exported(asset, name, len(rows))
+def write_voxels(points: Points, directory: Path, asset: StoredAsset) -> Exported:
+    """Write ``voxels/<id>_with_materials.npz`` of an asset."""
+    there = annotated_points(asset, points)
+    modulus, density, ratio = there.solid(asset).T
+    labels = np.array(asset.store.contents.labels, dtype="<U32")[there.material]
+    rows = np.rec.fromarrays([*there.in_slat.T, modulus, ratio, density, labels], VOXEL)
+    name = f"{FOLDER}/{file_name(asset.asset_id)}_with_materials.npz"
+    return _write(directory, name, asset, len(rows), {"voxel_data": rows})

@@ -6,8 +6,8 @@ of PhysGaussian loads (``load_point_cloud``).
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from slatprep.export.formats import (
     Points,
     Writer,
     annotated_points,
+    one_by_one,
 )
 from slatprep.records import COLOURS, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.arrays import write_ply
@@ -58,44 +59,31 @@ UNIT_CUBE: Bounds = np.array([[-0.5] * 3, [0.5] * 3])
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of a PLY for each asset; see `slatprep.export.FORMATS`."""
     bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
-    one = functools.partial(
-        write,
-        points=options.points or "slat",
-        frame=options.frame,
-        bounds=bounds,
-        max_distance=store.about.build.parameters.sample.max_distance,
-    )
-    return Writer(one, remarks=lambda _entries: notes)
+    one = partial(write, options.points or "slat", options.frame, bounds)
+    return one_by_one(one, remarks=lambda _entries: notes)
 
 
 def write(
-    directory: Path,
-    number: int,
-    assets: Iterable[StoredAsset],
-    *,
-    points: Points,
-    frame: Frame,
-    bounds: Mapping[str, Bounds],
-    max_distance: float,
-) -> Iterator[Exported]:
-    """Write a PLY of each asset's annotated points; `number` has no use here.
+    points: Points, frame: Frame, bounds: Mapping[str, Bounds], directory: Path, asset: StoredAsset
+) -> Exported:
+    """Write a PLY of an asset's annotated points.
 
     `bounds` has the world bounds by asset id, for the PixieVerse frame. ``conf`` is 1 for points
-    of the grid. For others it falls linearly to 0 at `max_distance` [voxel] from the annotation.
+    of the grid. For others it falls linearly to 0 at the largest distance that a lookup may have.
     ``part_label`` is the class, as in Pixie's own predictions.
     """
-    for asset in assets:
-        there = annotated_points(asset, points)
-        conf = np.clip(1.0 - there.distance / max_distance, 0.0, 1.0)
-        positions = there.in_slat
-        if frame == "pixieverse":
-            positions = to_world(there.in_pixieverse, bounds[asset.asset_id])
-        name = f"{file_name(asset.asset_id)}.ply"
-        columns = zip(asset.store.contents.properties, there.values.T, strict=True)
-        more = {(of.name, of.unit): own for of, own in columns if of.name not in PROPERTY_COLUMNS}
-        solid, material = there.solid(asset), there.material
-        write_points(directory / name, positions, material, solid, conf, _COMMENTS[frame], more)
-        yield Exported(asset, name, len(material))
+    there = annotated_points(asset, points)
+    max_distance = asset.store.about.build.parameters.sample.max_distance
+    conf = np.clip(1.0 - there.distance / max_distance, 0.0, 1.0)
+    positions = there.in_slat
+    if frame == "pixieverse":
+        positions = to_world(there.in_pixieverse, bounds[asset.asset_id])
+    name = f"{file_name(asset.asset_id)}.ply"
+    columns = zip(asset.store.contents.properties, there.values.T, strict=True)
+    more = {(of.name, of.unit): own for of, own in columns if of.name not in PROPERTY_COLUMNS}
+    solid, material = there.solid(asset), there.material
+    write_points(directory / name, positions, material, solid, conf, _COMMENTS[frame], more)
+    return Exported(asset, name, len(material))
 
 
 def write_points(
@@ -114,17 +102,11 @@ def write_points(
     """
     more = more or {}
     layout = np.dtype([*VERTEX.descr, *((name, "<f4") for name, _ in more)])
-    vertices = np.zeros(len(material), dtype=layout)
-    for axis, name in enumerate("xyz"):
-        vertices[name] = positions[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = COLOURS[material, channel]
-    vertices["alpha"] = 255
-    vertices["E"], vertices["density"], vertices["nu"] = properties.T
-    vertices["material_id"] = vertices["part_label"] = material
-    vertices["conf"] = conf
-    for (name, _), column in more.items():
-        vertices[name] = column
+    modulus, density, ratio = properties.T
+    alpha = np.full_like(material, 255)
+    colours = *COLOURS[material].T, alpha
+    fields = *positions.T, *colours, material, density, modulus, ratio, material, conf
+    vertices = np.rec.fromarrays([*fields, *more.values()], layout)
     units = ", ".join((UNITS, *(f"{name} {unit}" for name, unit in more if unit)))
     write_ply(path, vertices, frame, units)
 

@@ -8,7 +8,7 @@ usd-core is needed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -53,40 +53,32 @@ def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> 
         raise ConfigError(f"size is {options.size}; expected a length above 0 m")
     formats.require_solver_classes(store)
     _pxr("Usd")
-    one = partial(
-        write, points=options.points or "grid", size=options.size, materials=options.materials
-    )
-    return formats.Writer(one, finish=partial(write_scene, options.size), remarks=_remarks)
+    one = partial(write, options.points or "grid", options.size, options.materials)
+    finish = partial(write_scene, options.size)
+    return formats.one_by_one(one, finish=finish, remarks=_remarks)
 
 
 def write(
-    directory: Path,
-    number: int,
-    assets: Iterable[StoredAsset],
-    *,
-    points: formats.Points,
-    size: float,
-    materials: int,
-) -> Iterator[formats.Exported]:
-    """Write ``<id>.usdc`` of each asset, its unit cube `size` metres wide."""
-    for asset in assets:
-        there = formats.annotated_points(asset, points)
-        solid = there.solid(asset).astype(np.float64)
-        clipped = int(np.count_nonzero(solid[:, 2] > MAX_POISSON))
-        solid[:, 2] = np.minimum(solid[:, 2], MAX_POISSON)
-        name = f"{file_name(asset.asset_id)}.usdc"
-        binned = bin_materials(there.material, solid, materials)
-        width = size * _edge(asset, points)
-        _write_asset(directory / name, asset.asset_id, there.in_slat * size, width, solid, binned)
-        figures = {
-            "spacing": width,
-            "materials": len(binned.material),
-            "kilograms": float(solid[:, 1].sum() * width**3),
-            "E_error": binned.modulus_error,
-            "nu_error": binned.ratio_error,
-            "nu_clipped": clipped,
-        }
-        yield formats.Exported(asset, name, len(there.material), figures)
+    points: formats.Points, size: float, materials: int, directory: Path, asset: StoredAsset
+) -> formats.Exported:
+    """Write ``<id>.usdc`` of an asset, its unit cube `size` metres wide."""
+    there = formats.annotated_points(asset, points)
+    solid = there.solid(asset).astype(np.float64)
+    clipped = int(np.count_nonzero(solid[:, 2] > MAX_POISSON))
+    solid[:, 2] = np.minimum(solid[:, 2], MAX_POISSON)
+    name = f"{file_name(asset.asset_id)}.usdc"
+    binned = bin_materials(there.material, solid, materials)
+    width = size * _edge(asset, points)
+    _write_asset(directory / name, asset.asset_id, there.in_slat * size, width, solid, binned)
+    figures = {
+        "spacing": width,
+        "materials": len(binned.material),
+        "kilograms": float(solid[:, 1].sum() * width**3),
+        "E_error": binned.modulus_error,
+        "nu_error": binned.ratio_error,
+        "nu_clipped": clipped,
+    }
+    return formats.Exported(asset, name, len(there.material), figures)
 
 
 def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
