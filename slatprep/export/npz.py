@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
 from slatprep.export.formats import (
@@ -70,14 +69,14 @@ def write_latents(model: str, directory: Path, asset: StoredAsset) -> Exported:
     return _write(directory, name, asset, len(asset.coords), arrays)
 
 
-def _arrays(asset: StoredAsset, *names: str) -> dict[str, NDArray[Any]]:
+def _arrays(asset: StoredAsset, *names: str) -> dict[str, Any]:
     """Return arrays of an asset by name, and those of merged labels where the store has them."""
     merged = MERGED_COLUMNS if asset.store.merges else ()
     return {name: getattr(asset, name) for name in (*names, *merged)}
 
 
 def _write(
-    directory: Path, name: str, asset: StoredAsset, points: int, arrays: dict[str, NDArray[Any]]
+    directory: Path, name: str, asset: StoredAsset, points: int, arrays: dict[str, Any]
 ) -> Exported:
     """Write arrays of an asset, compressed."""
     (directory / name).parent.mkdir(parents=True, exist_ok=True)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.errors import StoreError, amount
 from slatprep.inspect.check import FITNESS, AlignmentCheck, check_alignment
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import draw_alignment, error_picture, outlined
-from slatprep.inspect.pictures.scene import FARTHEST, scene_of, views
+from slatprep.inspect.pictures.scene import FARTHEST, Scene, scene_of, views
 from slatprep.records import Place
 from slatprep.storage.atomic import staged
 from slatprep.storage.files import file_name
@@ -52,24 +55,31 @@ def write_pictures(
     cannot be written, or a record cannot be read.
     """
     kind = target.suffix.lower()[1:]
-    if alone := len(checks) == 1 and kind in canvas.FORMATS:
+    if len(checks) == 1 and kind in canvas.FORMATS:
         files = {checks[0].asset_id: target}
     else:
+        kind = "png"
         files = {one.asset_id: target / f"{file_name(one.asset_id)}.png" for one in checks}
-    tasks = ((store.path, check, kind if alone else "png") for check in checks)
-    for done, (asset_id, picture) in enumerate(run_unordered(_drawn, tasks, jobs), 1):
+    on_sheet = {one.asset_id for one in checks[:MOST]} if len(checks) > 1 else ()
+    tasks = ((store.path, one, kind, one.asset_id in on_sheet) for one in checks)
+    cells: dict[str, _Cell | None] = {}
+    for done, (asset_id, picture, cell) in enumerate(run_unordered(_drawn, tasks, jobs), 1):
         _write(files[asset_id], picture)
+        cells[asset_id] = cell
         if progress is not None:
             progress(done, len(checks))
-    if len(checks) < 2:
+    if not on_sheet:
         return list(files.values()), None
-    _write(target / SHEET, draw_sheet(store, checks[:MOST]))
+    _write(target / SHEET, _sheet([cell for one in checks if (cell := cells[one.asset_id])]))
     return list(files.values()), target / SHEET
 
 
 def sheet_of(store: Store, asset_ids: Sequence[str]) -> bytes:
     """Draw a contact sheet of up to `MOST` assets of a store."""
-    return draw_sheet(store, [check_alignment(store, one) for one in asset_ids[:MOST]])
+    chosen = map(store.asset, asset_ids[:MOST])
+    return _sheet(
+        [_cell(asset, scene_of(asset), check_alignment(store, asset.index)) for asset in chosen]
+    )
 
 
 def picture_of(asset: StoredAsset) -> Image:
@@ -77,43 +87,56 @@ def picture_of(asset: StoredAsset) -> Image:
     import PIL.Image
 
     check = check_alignment(asset.store, asset.index)
-    return PIL.Image.open(io.BytesIO(_drawn(asset.store.path, check, "png")[1]))
+    return PIL.Image.open(io.BytesIO(_drawn(asset.store.path, check, "png", False)[1]))
 
 
-def _drawn(path: Place, check: AlignmentCheck, kind: str) -> tuple[str, bytes]:
-    """Return an asset's id and its picture."""
+class _Cell(NamedTuple):
+    """An asset on a contact sheet: its check, its title, and its images side by side."""
+
+    check: AlignmentCheck
+    title: str
+    image: NDArray[np.float64]
+
+
+def _drawn(
+    path: Place, check: AlignmentCheck, kind: str, on_sheet: bool
+) -> tuple[str, bytes, _Cell | None]:
+    """Return an asset's id, its picture, and what is on the sheet of it."""
     store = open_store(path)
     asset = store.asset(check.asset_id)
+    scene, title = scene_of(asset), title_of(asset)
     alignment = StoredRecords(store).read(asset.index).alignment
     how = "engine {engine}, {model}, starts {search}".format_map(asset.columns)
     subtitle = f"{amount(len(asset.coords), 'SLAT voxel')}   {how}"
     finer = 1 if kind == "png" else 2
     with canvas.styled():
-        figure = draw_alignment(scene_of(asset), check, title_of(asset), subtitle, alignment, finer)
-        return check.asset_id, canvas.in_format(figure, kind)
+        figure = draw_alignment(scene, check, title, subtitle, alignment, finer)
+        picture = canvas.in_format(figure, kind)
+    return check.asset_id, picture, _cell(asset, scene, check) if on_sheet else None
 
 
-def draw_sheet(store: Store, checks: Sequence[AlignmentCheck]) -> bytes:
-    """Draw alignments, in this order, as one PNG."""
-    columns = min(_ACROSS, max(len(checks), 2))
-    rows = -(-len(checks) // columns)
+def _cell(asset: StoredAsset, scene: Scene, check: AlignmentCheck) -> _Cell:
+    view = views(scene, _THUMBNAIL)[0]
+    images = *outlined(scene, view, scene.placed), error_picture(scene, view)
+    return _Cell(check, title_of(asset), np.concatenate(images, axis=1))
+
+
+def _sheet(cells: Sequence[_Cell]) -> bytes:
+    """Draw assets, in this order, as one PNG."""
+    columns = min(_ACROSS, max(len(cells), 2))
+    rows = -(-len(cells) // columns)
     width = 2 * _MARGIN + columns * (_CELL_WIDTH + _GAP) - _GAP
     height = _HEAD + rows * _CELL_HEIGHT + _MARGIN
 
     with canvas.styled():
         figure = canvas.new_figure(width, height)
-        canvas.write(figure, _MARGIN, 46, f"{len(checks)} alignments", weight="bold", size=12)
+        canvas.write(figure, _MARGIN, 46, f"{len(cells)} alignments", weight="bold", size=12)
         words = "left: PixieVerse voxels by class, SLAT outlined; right: error per voxel, pale 0"
         canvas.note(figure, _MARGIN, 68, f"{words} to dark {FARTHEST:g} voxels")
-        for number, check in enumerate(checks):
+        for number, (check, title, image) in enumerate(cells):
             row, column = divmod(number, columns)
             x, y = _MARGIN + column * (_CELL_WIDTH + _GAP), _HEAD + row * _CELL_HEIGHT
-            asset = store.asset(check.asset_id)
-            scene, title = scene_of(asset), title_of(asset)
-            view = views(scene, _THUMBNAIL)[0]
-            images = *outlined(scene, view, scene.placed), error_picture(scene, view)
-            for k, image in enumerate(images):
-                canvas.draw_image(figure, x + k * _THUMBNAIL, y, image)
+            canvas.draw_image(figure, x, y, image)
             line, bold = y + _THUMBNAIL + 16, {"size": 7.5, "weight": "bold"}
             canvas.write(figure, x, line, canvas.cut(title, _TITLE), **bold)
             right = {**bold, "color": canvas.VERDICT_COLOURS[check.verdict], "ha": "right"}
