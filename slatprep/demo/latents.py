@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import FEATS_MEAN, FEATS_STD
-from slatprep.records.trellis2 import SHAPE_MEAN, SHAPE_STD
+from slatprep.records.encoders import SHAPE_MEAN, SHAPE_STD
 
 LatentKind = Literal["placeholder", "material"]
 

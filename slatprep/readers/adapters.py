@@ -20,6 +20,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.foreign import ForeignLatents, ForeignSource
 from slatprep.readers.patterns import find_files, list_below, tried_names
+from slatprep.records.encoders import LATENTS
 from slatprep.storage.files import Listing
 
 
@@ -89,18 +90,6 @@ SOURCES = {
 }
 """slatprep's own source adapters."""
 
-LATENTS = {
-    "trellis": "slatprep.readers.slat:trellis",
-    "sam3d": "slatprep.readers.slat:sam3d",
-    "trellis2": "slatprep.readers.slat:trellis2",
-    "trellis2-512": "slatprep.readers.slat:trellis2_512",
-    "trellis2-shape-pbr": "slatprep.readers.slat:trellis2_shape_pbr",
-    "trellis2-shape-pbr-512": "slatprep.readers.slat:trellis2_shape_pbr_512",
-    "trellis2-pbr": "slatprep.readers.slat:trellis2_pbr",
-    "trellis2-pbr-512": "slatprep.readers.slat:trellis2_pbr_512",
-}
-"""slatprep's own latent adapters."""
-
 
 def source_adapter(name: str) -> SourceAdapter:
     """Return the source adapter of a name; ConfigError if none has it or it does not load."""
@@ -109,8 +98,8 @@ def source_adapter(name: str) -> SourceAdapter:
 
 
 def latent_adapter(name: str) -> LatentAdapter | None:
-    """Return the latent adapter of a name, or None; ConfigError if it does not load."""
-    if name not in _known("slatprep.latents"):
+    """Return another package's adapter of this name, or None; ConfigError if it does not load."""
+    if name in LATENTS or name not in _known("slatprep.latents"):
         return None
     adapter: LatentAdapter = _loaded("slatprep.latents", name)
     return adapter
@@ -146,7 +135,7 @@ def _loaded(group: str, name: str) -> Any:
 @lru_cache(maxsize=2)
 def _known(group: str) -> dict[str, tuple[str, str | None]]:
     """Return where each adapter of a group lies, and its package; None for slatprep's own."""
-    own = SOURCES if group == "slatprep.sources" else LATENTS
+    own = SOURCES if group == "slatprep.sources" else dict.fromkeys(LATENTS, "")
     known: dict[str, tuple[str, str | None]] = {name: (own[name], None) for name in own}
     for point in entry_points(group=group):
         package = f"{point.dist.name} {point.dist.version}" if point.dist else ""

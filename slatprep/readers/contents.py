@@ -17,6 +17,7 @@ from slatprep.parameters import BuildParameters, SlatSource
 from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, source_adapter
 from slatprep.readers.files import refusing
 from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
+from slatprep.records.encoders import LATENTS
 from slatprep.storage.documents import read_document
 from slatprep.storage.place import place_of
 
@@ -88,11 +89,11 @@ _MAX_BYTES = 2**20
 def latent_space(source: SlatSource) -> LatentSpace:
     """Return the space of a source's latents, as far as known before they are read.
 
-    ``source.encoder`` names a latent adapter, or a JSON file with ``encoder`` (a name),
+    ``source.encoder`` is of `LATENTS`, a latent adapter, or a JSON file with ``encoder`` (a name),
     ``channels``, ``resolution`` and optionally ``mean`` and ``std``. ConfigError if neither fits.
     """
-    adapter = latent_adapter(source.encoder)
-    known = adapter.space if adapter else _read_space(place_of(source.encoder))
+    own, adapter = LATENTS.get(source.encoder), latent_adapter(source.encoder)
+    known = own or (adapter.space if adapter else _read_space(place_of(source.encoder)))
     return replace(known, standardised=source.standardised == "yes")
 
 

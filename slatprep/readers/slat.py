@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,54 +11,11 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
-from slatprep.parameters import SlatSource
 from slatprep.readers.contents import ENOUGH, in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays, load_group
 from slatprep.records import RESOLUTION, TRELLIS, LatentSpace, Place, SourceFile, StructuredLatents
-from slatprep.records.trellis2 import PBR_MEAN, PBR_STD, SHAPE_MEAN, SHAPE_STD
 from slatprep.storage.place import storage_of
-
-
-@dataclass(frozen=True)
-class _Slat:
-    """Reader of latents in the layout of TRELLIS's tools."""
-
-    space: LatentSpace
-    patterns: tuple[str, ...] = ()
-
-    def read(self, path: Place, root: Place, group: str, space: LatentSpace) -> StructuredLatents:
-        """Read one SLAT; see `read_slat`."""
-        return read_slat(path, root, group, space)
-
-
-def _trellis2(
-    kind: str,
-    moments: tuple[tuple[float, ...], tuple[float, ...]],
-    folder: str = "shape_latents",
-    resolution: int = 1024,
-) -> partial[_Slat]:
-    """Return what makes a reader of latents that TRELLIS.2's toolkit puts into such a folder.
-
-    The encoder's grid is a sixteenth as fine as the `resolution` of the object.
-    """
-    space = LatentSpace(f"trellis2{kind}", len(moments[0]), resolution // 16, *moments)
-    ours, default = f"{folder}/*_{resolution}/", "shape_latents/*_1024/"
-    return partial(_Slat, space, tuple(one.replace(default, ours) for one in SlatSource.pattern))
-
-
-_SHAPE, _PBR = (SHAPE_MEAN, SHAPE_STD), (PBR_MEAN, PBR_STD)
-_BOTH = (*SHAPE_MEAN, *PBR_MEAN), (*SHAPE_STD, *PBR_STD)
-"""Of shape latents with the texture latents of the same voxels behind."""
-
-trellis = partial(_Slat, TRELLIS)
-sam3d = partial(_Slat, replace(TRELLIS, encoder="sam3d"))
-trellis2 = _trellis2("", _SHAPE)
-trellis2_512 = _trellis2("-512", _SHAPE, resolution=512)
-trellis2_pbr = _trellis2("-pbr", _PBR, "pbr_latents")
-trellis2_pbr_512 = _trellis2("-pbr-512", _PBR, "pbr_latents", 512)
-trellis2_shape_pbr = _trellis2("-shape-pbr", _BOTH)
-trellis2_shape_pbr_512 = _trellis2("-shape-pbr-512", _BOTH, resolution=512)
 
 
 def texture_of(path: Place, space: LatentSpace) -> Place | None:

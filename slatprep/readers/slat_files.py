@@ -12,6 +12,7 @@ from slatprep.readers.adapters import latent_adapter
 from slatprep.readers.hdf5 import SUFFIXES
 from slatprep.readers.patterns import find_files, held_names, list_below, tried_names
 from slatprep.records import Place
+from slatprep.records.encoders import LATENTS
 from slatprep.storage.archives import is_archive
 from slatprep.storage.place import storage_of
 
@@ -125,8 +126,17 @@ def _hint(source: SlatSource) -> str:
 
 def slat_patterns(source: SlatSource) -> tuple[str, ...]:
     """Return the patterns of the dataset definition, or the encoder's own where it has none."""
-    own = getattr(latent_adapter(source.encoder), "patterns", ())
-    return own if own and source.pattern == SlatSource.pattern else source.pattern
+    usual = SlatSource.pattern
+    if source.pattern != usual:
+        return source.pattern
+    space = LATENTS.get(source.encoder)
+    if space is None:
+        own: tuple[str, ...] = getattr(latent_adapter(source.encoder), "patterns", ())
+        return own or usual
+    # The folder into which TRELLIS.2's toolkit puts latents of this kind and fineness.
+    kind = "pbr" if space.encoder.startswith("trellis2-pbr") else "shape"
+    folder = f"{kind}_latents/*_{16 * space.resolution}/"
+    return tuple(one.replace("shape_latents/*_1024/", folder) for one in usual)
 
 
 def _each_slat(source: SlatSource, one_file: bool) -> Iterator[NamedSlat]:

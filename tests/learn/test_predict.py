@@ -30,8 +30,8 @@ from slatprep.learn.predictions import check_prediction
 from slatprep.learn.published import SECONDS, SECONDS_OF_OTHERS
 from slatprep.normalize import PIXIE_RANGES, normalization_of, normalize_properties
 from slatprep.particles.fields import predicted_field
-from slatprep.readers.slat import trellis2
 from slatprep.records import FEATS_MEAN, FEATS_STD, PIXIEVERSE, StructuredLatents
+from slatprep.records.encoders import LATENTS
 
 RANGES = np.array([[3.0, 9.0], [1.0, 4.0], [0.1, 0.5]])
 
@@ -314,7 +314,7 @@ def test_gaussians_of_stored_latents_and_of_standardised_ones(
 
 
 def test_latents_of_another_encoder_are_no_input(checkpoint, tmp_path):
-    make_store(tmp_path / "s.zarr", replace(PIXIEVERSE, latents=trellis2().space))
+    make_store(tmp_path / "s.zarr", replace(PIXIEVERSE, latents=LATENTS["trellis2"]))
     words = ("predict", tmp_path / "s.zarr", "--checkpoint", checkpoint, "--out", tmp_path / "p")
     assert "latents of trellis2 (32 channels); expected those of trellis" in step(*words, code=2)
 

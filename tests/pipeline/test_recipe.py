@@ -14,7 +14,7 @@ from slatprep.pipeline import fingerprint
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.pipeline.fingerprint import code_fingerprint, numeric_modules
 from slatprep.pipeline.recipe import Recipe
-from slatprep.readers.adapters import LATENTS, SOURCES
+from slatprep.readers.adapters import SOURCES
 from slatprep.store.record import AssetRecord, StageParameters
 from slatprep.store.record_json import read_asset_record
 
@@ -141,7 +141,7 @@ def test_it_covers_every_module_that_an_asset_runs_through_and_is_the_same_elsew
 
 def test_what_makes_numbers_is_in_it_and_nothing_else():
     modules = numeric_modules()
-    readers = {name.partition(":")[0] for name in [*SOURCES.values(), *LATENTS.values()]}
+    readers = {name.partition(":")[0] for name in SOURCES.values()}
     merging = {f"slatprep.{name}" for name in ("pipeline.annotate", "storage.chunks")}
     assert readers | merging | {"slatprep.storage.chunks"} <= modules.keys()
     others = ("slatprep.storage.pl", "slatprep.cli", "slatprep.store")

@@ -154,7 +154,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
         "torn": "def (",
         "boom": "raise RuntimeError('at import')",
         "leave": "import sys; sys.exit(3)",
-        "borrowed": "from slatprep.readers.slat import trellis as made",
+        "borrowed": "from slatprep.records import TRELLIS\nclass made: space = TRELLIS",
     }
     modules = {f"adapter_{name}": code for name, code in codes.items()}
     lines = "".join(f"{name} = adapter_{name}:made\n" for name in (*codes, "gone"))

@@ -13,8 +13,8 @@ from support.raw_sources import COORDS, FEATS
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents, read_slat
-from slatprep.readers.adapters import latent_adapter
 from slatprep.readers.contents import latent_space, look_standardised, resolve_latents, tell_alone
+from slatprep.readers.slat_files import slat_patterns
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
 
 BATCHED = np.concatenate([np.zeros((3, 1), np.int32), COORDS.astype(np.int32)], axis=1)
@@ -224,20 +224,19 @@ def test_raw_and_standardised_latents_are_told_apart(seed):
                 assert look_standardised(moments, TRELLIS) is right
 
 
-def test_trellis_2_has_the_moments_that_microsoft_publishes():
+def test_trellis_2_has_the_moments_that_microsoft_publishes(tmp_path):
     for name, mean, std in (
         ("trellis2", 0.781296, 5.972266),
         ("trellis2-512", 0.781296, 5.972266),
         ("trellis2-pbr", 3.501659, 2.665652),
         ("trellis2-pbr-512", 3.501659, 2.665652),
     ):
-        adapter = latent_adapter(name)
-        assert adapter is not None
-        space = adapter.space
+        source = SlatSource(tmp_path, encoder=name)
+        space = latent_space(source)
         assert (space.encoder, space.channels, len(space.std)) == (name, 32, 32)
         assert (space.mean[0], space.std[0]) == (mean, std)
         folder = f"{'pbr' if 'pbr' in name else 'shape'}_latents/*_{space.resolution * 16}/"
-        assert f"{folder}{{id}}.npz" in (getattr(adapter, "patterns", ()) or SlatSource.pattern)
+        assert f"{folder}{{id}}.npz" in slat_patterns(source)
 
 
 def test_unpublished_moments_are_those_of_all_voxels_of_the_dataset():

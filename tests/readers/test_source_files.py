@@ -62,10 +62,14 @@ def test_paths_that_are_no_file_of_the_root(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "inside").write_bytes(b"x")
     (tmp_path / "link").symlink_to("inside")
+    (tmp_path / "torn").symlink_to("gone")
+    (tmp_path / "endless").symlink_to("/dev/zero")
     for name, fault in (
         ("folder", "not a regular file"),
         ("pipe", "not a regular file"),
         ("loop", "cannot be opened"),
+        ("torn", "is a link that leads nowhere"),
+        ("endless", "leads to /d"),
         ("a\0b", "cannot be opened"),
         ("none", "does not exist"),
         ("", "not a regular file"),

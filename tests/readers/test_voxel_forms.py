@@ -1,4 +1,4 @@
-"""Forms of annotated voxels: each is read as it was written, and what cannot be read is said."""
+"""Voxels and parts of any form are read as they were written, and what cannot be read is said."""
 
 import json
 import os
@@ -23,9 +23,10 @@ from slatprep.demo.sources import (
 from slatprep.errors import ConfigError, InputError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
-from slatprep.pipeline.dataset import build_store
+from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.readers.files import load_source
-from slatprep.records import Engine
+from slatprep.records import Engine, MaterialField
+from slatprep.store import open_store
 
 TABLE = (
     {"name": "density", "unit": "kg/m^3", "scale": "log10"},
@@ -247,26 +248,149 @@ def test_a_ply_that_claims_more_than_it_has_is_refused(root):
         field_at(root)
 
 
+HANDLE = {"density": "7.8 g/cm^3", "Young's Modulus (GPa)": "200", "Poisson's Ratio": "0.29"}
+HEAD = {"density": "1.1 g/cm^3", "Young's Modulus (GPa)": 0.01, "Poisson's Ratio": 0.45}
+
+
+def write_object(
+    folder: Path, parts: list[tuple[dict[str, Any], Any]], nested: bool = False
+) -> Path:
+    """Write parts as PhysX-Anything does, with more keys than are read; return their root."""
+    root = folder / "p"
+    rows = [
+        {"label": label, "name": f"part {label}", "priority_rank": 1, "material": "stuff", **stuff}
+        for label, (stuff, _) in enumerate(parts)
+    ]
+    about = {"object_name": "thing", "dimension": "10*10*10", "parts": rows, "group_info": {}}
+    (root / "finaljson").mkdir(parents=True)
+    (root / "finaljson" / "a.json").write_text(json.dumps(about))
+    for label, (_, mesh) in enumerate(parts):
+        place = root / "partseg" / "a" / "objs" / (str(label) if nested else "")
+        place.mkdir(parents=True, exist_ok=True)
+        mesh.export(place / f"{label}.obj")
+    return root
+
+
+def cuboid(*corners: tuple[float, float, float]) -> Any:
+    """Return the mesh of a box by two opposite corners."""
+    return pytest.importorskip("trimesh").creation.box(bounds=corners)
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_parts_are_filled_and_have_their_own_materials(nested, tmp_path):
+    # A hammer along x, of any scale and place: head for x in 24..32, handle for 0..24, of 32.
+    handle, head = cuboid((100, 0, 0), (124, 4, 4)), cuboid((124, -6, -2), (132, 10, 6))
+    field = field_at(write_object(tmp_path, [(HANDLE, handle), (HEAD, head)], nested), "parts")
+    x = field.voxels[:, 0].astype(int)
+    assert x.min() == 0 and x.max() == 63
+    is_head = x > 48
+    np.testing.assert_allclose(field.properties[is_head], [[1e7, 1100, 0.45]] * is_head.sum())
+    inner = x < 47
+    np.testing.assert_allclose(field.properties[inner], [[2e11, 7800, 0.29]] * inner.sum())
+    # The volume of a solid, within the half voxel that a surface is thick.
+    expected = (24 * 4 * 4 + 8 * 16 * 8) * 8
+    assert expected < len(field.voxels) < 1.45 * expected
+    assert field.table[0].name == "youngs_modulus" and not field.classified
+
+
+def test_what_lies_inside_another_part_keeps_its_own(tmp_path):
+    inside, outside = cuboid((-4, -4, -4), (4, 4, 4)), cuboid((-16, -16, -16), (16, 16, 16))
+    field = field_at(write_object(tmp_path, [(HANDLE, inside), (HEAD, outside)]), "parts")
+    assert len(field.voxels) == 64**3
+    centre = np.abs(field.voxels.astype(int) - 31.5).max(axis=1) < 8
+    assert (field.properties[centre, 1] == 7800).all()
+    assert (field.properties[~centre, 1] == 1100).mean() > 0.98
+
+
+CUBE = (0, 0, 0), (1, 1, 1)
+
+
+def test_units_may_be_stated_in_the_definition(tmp_path):
+    stuff = {"density": 7800, "Young's Modulus (GPa)": 200_000, "Poisson's Ratio": 0.29}
+    root = write_object(tmp_path, [(stuff, cuboid(*CUBE))])
+    field = field_at(root, "parts", youngs_modulus="MPa", density="kg/m^3")
+    np.testing.assert_allclose(field.properties[0], [2e11, 7800, 0.29])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("density", "heavy", r"part 0 has density 'heavy'; expected a number or g/cm"),
+        ("density", "1 lb/ft^3", r"part 0 has density '1 lb/ft"),
+        ("Poisson's Ratio", None, r"part 0 has Poisson's Ratio None; expected a number"),
+        ("label", "x", r"is no annotation of parts"),
+        ("mesh", "v 0 0 0\n", r"is no mesh"),
+        ("mesh", None, r"part 0 has no mesh"),
+    ],
+)
+def test_parts_that_are_none_are_named(key, value, said, tmp_path):
+    root = write_object(tmp_path, [({**HEAD, key: value}, cuboid(*CUBE))])
+    if key == "mesh":
+        mesh = root / "partseg" / "a" / "objs" / "0.obj"
+        mesh.unlink() if value is None else mesh.write_text(value)
+    with pytest.raises(InputError, match=said):
+        field_at(root, "parts")
+
+
+def shell_of(field: MaterialField) -> np.ndarray:
+    """Return the annotated voxels (K, 3) that have a neighbour which is not."""
+    solid = np.zeros((66,) * 3, bool)
+    solid[tuple(field.voxels.T.astype(int) + 1)] = True
+    buried = np.all([np.roll(solid, s, a) for s in (-1, 1) for a in range(3)], axis=0)
+    return (np.argwhere(solid & ~buried) - 1).astype(np.uint8)
+
+
+def known_build(root: Path, adapter: str, coords: np.ndarray) -> tuple[BuildParameters, Path]:
+    """Give the one object below a root a SLAT in its own frame; return how to build, and where."""
+    feats = np.random.default_rng(0).normal(0, 3, (len(coords), 8)).astype(np.float32)
+    slat = root.parent / "slat"
+    slat.mkdir(exist_ok=True)
+    np.savez(slat / "a.npz", coords=coords, feats=feats)
+    source, known = PixieverseSource(root, adapter=adapter), AlignParameters(engine=Engine.KNOWN)
+    return BuildParameters(source, SlatSource(slat), align=known), root.parent / "s.zarr"
+
+
 @pytest.mark.usefixtures("files_are_old")
 def test_changed_voxels_of_a_zarr_group_are_looked_up_anew(root):
     box = np.argwhere(np.ones((20, 14, 9))) + 22
     rows = {"voxels": box, "density": np.full(len(box), 500.0), "damping": np.full(len(box), 0.5)}
-    rows["material"] = np.zeros(len(box), np.uint8)
-    rows["material"][box[:, 0] > 30] = 1
+    rows["material"] = (box[:, 0] > 30).astype(np.uint8)
     write_description(root, TABLE, CLASSES, aligned=True)
     write_voxels(root, "a", "zarr", rows)
-    slat = root.parent / "slat"
-    slat.mkdir()
-    feats = np.random.default_rng(0).normal(0, 3, (len(box), 8)).astype(np.float32)
-    np.savez(slat / "a.npz", coords=box.astype(np.uint8), feats=feats)
-    source = PixieverseSource(root, adapter="voxels")
-    parameters = BuildParameters(
-        source, SlatSource(slat), align=AlignParameters(engine=Engine.KNOWN)
-    )
-    first = build_store(parameters, root.parent / "s.zarr")
-    assert build_store(parameters, root.parent / "s.zarr").build_id == first.build_id
-    assert not verify_store(root.parent / "s.zarr", sources=True).findings
+    of = _, store = known_build(root, "voxels", box.astype(np.uint8))
+    first = build_store(*of)
+    assert build_store(*of).build_id == first.build_id
+    assert not verify_store(store, sources=True).findings
     write_voxels(root, "a", "zarr", rows | {"density": np.full(len(box), 600.0)})
-    (finding,) = verify_store(root.parent / "s.zarr", sources=True).findings
+    (finding,) = verify_store(store, sources=True).findings
     assert "bytes" in finding.what
-    assert build_store(parameters, root.parent / "s.zarr").build_id != first.build_id
+    assert build_store(*of).build_id != first.build_id
+
+
+@pytest.mark.usefixtures("files_are_old")
+def test_a_store_of_parts_follows_every_mesh(tmp_path):
+    """A hammer with a hook, of which one part after the other becomes smaller."""
+    parts = [
+        (HANDLE, cuboid((0, 0, 0), (24, 4, 4))),
+        (HEAD, cuboid((20, -6, -2), (32, 10, 6))),
+        (HANDLE, cuboid((2, 1, 0), (5, 3, 12))),
+    ]
+    root = write_object(tmp_path, parts)
+    of = _, store = known_build(root, "parts", shell_of(field_at(root, "parts")))
+
+    def heavy() -> np.ndarray:
+        """Say which voxels of the asset are of the handle's material."""
+        return open_store(store).asset("a").properties_si[:, 1] > 5000
+
+    assert build_store(*of).verdicts == {"good": 1}
+    assert 0.05 < heavy().mean() < 0.9
+    record = json.loads((tmp_path / "s.manifests" / "assets.jsonl").read_text().splitlines()[0])
+    names = {file["path"] for file in record["sources"]}
+    assert {f"partseg/a/objs/{k}.obj" for k in range(3)} <= names
+    for part, half in ((2, ((2, 1, 0), (5, 3, 7))), (0, ((0, 0, 0), (12, 4, 4)))):
+        assert plan_build(*of).assets[0].reason == "unchanged"
+        cuboid(*half).export(root / "partseg" / "a" / "objs" / f"{part}.obj")
+        assert plan_build(*of).assets[0].reason == "sources changed: description"
+        before = heavy()
+        build_store(*of)
+        assert heavy().sum() < 0.95 * before.sum()

@@ -1,11 +1,16 @@
-"""TRELLIS.2's moments, as Microsoft publishes them with its flow models.
+"""The encoders whose latents slatprep knows, with the moments that are published of them.
 
-From microsoft/TRELLIS.2 (MIT license): ``configs/gen/slat_flow_img2shape_dit_1_3B_512_bf16.json``,
-``normalization``, and ``configs/gen/slat_flow_imgshape2tex_dit_1_3B_512_bf16.json``,
-``pbr_slat_normalization``. Those of resolution 1024 (``..._ft1024.json``) are the same.
+TRELLIS.2's are from microsoft/TRELLIS.2 (MIT license), where they stand with its flow models:
+``configs/gen/slat_flow_img2shape_dit_1_3B_512_bf16.json``, ``normalization``, and
+``configs/gen/slat_flow_imgshape2tex_dit_1_3B_512_bf16.json``, ``pbr_slat_normalization``. Those of
+resolution 1024 (``..._ft1024.json``) are the same.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
+
+from slatprep.records.tables import TRELLIS, LatentSpace
 
 # fmt: off
 SHAPE_MEAN = (
@@ -33,3 +38,16 @@ PBR_STD = (
     2.680878, 2.372054, 2.451546, 2.353556, 2.995195, 2.379849, 2.786195, 2.775190,
 )
 # fmt: on
+
+LATENTS = {one.encoder: one for one in (TRELLIS, replace(TRELLIS, encoder="sam3d"))}
+"""The space of each encoder's latents, by its name."""
+
+for _name, _mean, _std in (
+    ("trellis2", SHAPE_MEAN, SHAPE_STD),
+    # Shape latents with the texture latents of the same voxels behind.
+    ("trellis2-shape-pbr", SHAPE_MEAN + PBR_MEAN, SHAPE_STD + PBR_STD),
+    ("trellis2-pbr", PBR_MEAN, PBR_STD),
+):
+    # Of objects at 1024^3, and at 512^3: the grid of latents is a sixteenth as fine.
+    for _size, _side in (("", 64), ("-512", 32)):
+        LATENTS[_name + _size] = LatentSpace(_name + _size, len(_mean), _side, _mean, _std)
