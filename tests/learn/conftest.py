@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from support.synthetic import Dataset
 
 from slatprep.learn import decoder
 from slatprep.pipeline.dataset import build_store
+from slatprep.store import open_store
 
 # Nothing but time depends on the size of the decoder that is trained.
 decoder.SIZES["tiny"] = decoder.DecoderSize(24, 2, 2)
@@ -22,9 +24,16 @@ def _as_it_was() -> None:
 
 @pytest.fixture(scope="session")
 def learn_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build a store of nine rows: eight objects, of which one has two views."""
+    """Build a store of nine rows: eight objects, of which one has two views.
+
+    Of ``b``, 12 voxels lie in a corner without an annotation near, so that they have no label.
+    """
     dataset = Dataset(tmp_path_factory.mktemp("learn")).having(*"abcdefg")
+    whole, corner = dataset.assets["b"], np.argwhere(np.ones((2, 2, 3))).astype(np.uint8)
+    coords = np.concatenate([whole.coords, corner])
+    dataset.write_slat("b.npz", coords, np.concatenate([whole.feats, whole.feats[:12]]))
     dataset.add("h", 7, views=("front", "side"))
     out = tmp_path_factory.mktemp("learn_store") / "learn.zarr"
     build_store(dataset.parameters(), out)
+    assert [int(np.sum(~one.valid)) for one in open_store(out)] == [0, 12, *[0] * 7]
     return out

@@ -32,7 +32,7 @@ from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 from slatprep.learn.splits import assign_store
 from slatprep.normalize import PIXIE_RANGES
-from slatprep.parameters import NormalizeParameters, SampleParameters
+from slatprep.parameters import BuildParameters, NormalizeParameters, SampleParameters
 from slatprep.pipeline.dataset import build_store
 
 
@@ -171,6 +171,7 @@ NAMES = "abcd"
 class Case:
     """A store, its raw grids, and predictions of them by a method that errs."""
 
+    parameters: BuildParameters
     store: Path
     grids: dict[str, np.ndarray]
     predicted: dict[str, np.ndarray]
@@ -223,7 +224,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         written(path, np.ascontiguousarray(np.moveaxis(channels, -1, 0)))
         written(folder / "four" / f"{name}.npy", np.moveaxis(grid, -1, 0).copy())
     grids = {name: dataset.assets[name].grid for name in NAMES}
-    return Case(store, grids, predicted, folder / "eleven")
+    return Case(parameters, store, grids, predicted, folder / "eleven")
 
 
 def compared(case: Case, root: Path | None = None, **others: Any) -> Comparison:
@@ -272,12 +273,11 @@ def test_at_slat_voxels_the_nearest_annotated_voxel_is_looked_up(case):
     np.testing.assert_allclose(list(found.means.values()), np.mean(rows, axis=0), atol=1e-6)
 
 
-def test_other_ranges_are_brought_to_the_store_s(case, make_dataset, tmp_path):
-    dataset = make_dataset(*NAMES)
-    for name, grid in case.grids.items():
-        dataset.write_grid(name, grid)
-    build_store(dataset.parameters(), tmp_path / "s.zarr")
-    here = open_store(tmp_path / "s.zarr").normalization.ranges
+def test_other_ranges_are_brought_to_the_store_s(case, tmp_path):
+    store = Path(shutil.copytree(case.store, tmp_path / "s.zarr"))
+    build_store(replace(case.parameters, normalize=NormalizeParameters()), store)
+    here = open_store(store).normalization.ranges
+    assert here != open_store(case.store).normalization.ranges
     width = np.array([one.hi - one.lo for one in here])[[1, 0, 2]]
     rows = []
     for name, grid in case.predicted.items():
@@ -287,8 +287,7 @@ def test_other_ranges_are_brought_to_the_store_s(case, make_dataset, tmp_path):
         truth = case.grids[name][..., :3][mask].astype(np.float64)
         truth[:, :2] = np.log10(truth[:, :2])
         rows.append((((mapped - truth) * 2 / width) ** 2).mean(axis=0)[[1, 0, 2]])
-    other = replace(case, store=tmp_path / "s.zarr")
-    found = compared(other).methods["m, own grid"].means
+    found = compared(replace(case, store=store)).methods["m, own grid"].means
     np.testing.assert_allclose(list(found.values())[:3], np.mean(rows, axis=0), rtol=1e-5)
 
 
@@ -372,7 +371,7 @@ def test_occupied_voxels_without_a_class_are_counted(make_dataset, tmp_path):
     grid[tuple(np.argwhere(grid[..., 3] == 0)[:5].T)] = (0, 0, 0, -1)
     dataset.write_grid("a", grid)
     build_store(dataset.parameters(), tmp_path / "s.zarr")
-    one = Case(tmp_path / "s.zarr", {}, {}, dataset.root / "pixieverse")
+    one = Case(dataset.parameters(), tmp_path / "s.zarr", {}, {}, dataset.root / "pixieverse")
     found = compared(one)
     assert found.partly_annotated == 1 and found.problems == []
     # Labels by vote, too, are what the grids they are of say.
