@@ -6,7 +6,7 @@ Where there are several, each is aligned by itself.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,17 +33,6 @@ from slatprep.storage.faults import reached
 from slatprep.store.record import MAX_SOURCES, StageParameters
 
 
-@dataclass(frozen=True, eq=False)
-class Annotated:
-    """One annotation of an object, looked up at the SLAT's voxels through its own alignment."""
-
-    pair: AssetPair
-    field: MaterialField
-    alignment: Alignment
-    judgement: Judgement
-    annotation: Annotation
-
-
 def annotate(
     pair: AssetPair,
     field: MaterialField,
@@ -51,7 +40,7 @@ def annotate(
     parameters: BuildParameters | StageParameters,
     alignment: Alignment | None = None,
     judgement: Judgement | None = None,
-) -> Annotated:
+) -> Finished:
     """Align a field, look it up at the SLAT's voxels, and judge both.
 
     An alignment or judgement that is known of the same field and SLAT stands.
@@ -61,7 +50,7 @@ def annotate(
         alignment = align(field, latents, parameters.align)
     reached("asset reused" if reused else "asset aligned", pair.asset_id)
     annotation, judgement = look_up(field, latents, alignment, parameters.sample, judgement)
-    return Annotated(pair, field, alignment, judgement, annotation)
+    return Finished(pair, field, latents, alignment, annotation, judgement)
 
 
 def look_up(
@@ -97,7 +86,7 @@ def process_several(
     if len(sources) > MAX_SOURCES:
         what = f"has {len(pair.annotations):,} annotations in {len(sources):,} files to be merged"
         raise InputError(f"asset {pair.asset_id!r}", what, f"at most {MAX_SOURCES} files")
-    latents, annotated, faults = _annotations(pair, parameters, known, sources, digests)
+    annotated, faults = _annotations(pair, parameters, known, sources, digests)
     contents = pair.roots.contents
     good = [one for one in annotated if one.judgement.verdict is not Verdict.FAILED] or annotated
     lacks = {one.pair.sample: lacking(one.field, contents) for one in good}
@@ -114,17 +103,16 @@ def process_several(
     told = {sample: Contribution(sample, (), why) for sample, why in whys.items()}
     told |= {one.pair.sample: _contribution(one, one in good, sources) for one in annotated}
     contributions = tuple(told[one.sample] for one in pair.annotations)
-    return Finished(
-        pair,
-        replace(first.field, warnings=_warnings(good, lacks, contributions)),
-        latents,
-        first.alignment,
-        annotation,
-        merged(first.judgement, annotation),
-        contributions,
-        sources,
-        digests,
-        tuple(one.field for one in good[1:]),
+    return replace(
+        first,
+        pair=pair,
+        field=replace(first.field, warnings=_warnings(good, lacks, contributions)),
+        annotation=annotation,
+        judgement=merged(first.judgement, annotation),
+        contributions=contributions,
+        sources=sources,
+        digests=digests,
+        others=tuple(one.field for one in good[1:]),
     )
 
 
@@ -134,11 +122,11 @@ def _annotations(
     known: tuple[Contribution, ...],
     sources: tuple[SourceFile, ...],
     digests: Mapping[str, str],
-) -> tuple[StructuredLatents, list[Annotated], dict[str, InputError]]:
-    """Return the latents, each annotation that can be used, and why the others cannot."""
+) -> tuple[list[Finished], dict[str, InputError]]:
+    """Return each annotation that can be used, and why the others cannot."""
     before = {one.sample: one for one in known}
     latents: StructuredLatents | None = None
-    annotated: list[Annotated] = []
+    annotated: list[Finished] = []
     faults: dict[str, InputError] = {}
     for one in pair.annotations:
         try:
@@ -157,17 +145,17 @@ def _annotations(
         alignment = found.alignment if found else _same_alignment(field, annotated)
         judgement = found.judgement if found else None
         annotated.append(annotate(one, field, latents, parameters, alignment, judgement))
-    if latents is None:
+    if not annotated:
         if len(set(map(str, faults.values()))) == 1:
             raise next(iter(faults.values()))
         what = f"none of its {len(faults)} annotations can be used"
         reasons = [f"sample {sample}: {error}" for sample, error in faults.items()]
         raise _unusable(pair, what, reasons, "one that can be")
-    return latents, annotated, faults
+    return annotated, faults
 
 
 def _warnings(
-    good: list[Annotated],
+    good: list[Finished],
     lacks: Mapping[str, tuple[str, ...]],
     contributions: tuple[Contribution, ...],
 ) -> tuple[str, ...]:
@@ -188,7 +176,7 @@ def _replaced(one: AssetPair) -> InputError:
     return InputError(f"asset {one.asset_id!r}", what, "files that stay; build again")
 
 
-def _same_alignment(field: MaterialField, annotated: list[Annotated]) -> Alignment | None:
+def _same_alignment(field: MaterialField, annotated: list[Finished]) -> Alignment | None:
     """Return the alignment of a field with the same geometry, which is all that engines use."""
     for one in annotated:
         frames = [own.frame is None or own.frame.tobytes() for own in (field, one.field)]
@@ -197,7 +185,7 @@ def _same_alignment(field: MaterialField, annotated: list[Annotated]) -> Alignme
     return None
 
 
-def _contribution(one: Annotated, is_good: bool, sources: tuple[SourceFile, ...]) -> Contribution:
+def _contribution(one: Finished, is_good: bool, sources: tuple[SourceFile, ...]) -> Contribution:
     """Return what became of an annotation that can be used."""
     left_out = "" if is_good else f"its alignment failed: {one.judgement.reasons[0]}"
     files = tuple(k for k, file in enumerate(sources) if file in one.field.sources)

@@ -44,7 +44,6 @@ from slatprep.readers import read_field, read_latents, reading_of, source_digest
 from slatprep.records import (
     RESOLUTION,
     AssetPair,
-    Failed,
     Finished,
     MaterialField,
     Model,
@@ -54,7 +53,7 @@ from slatprep.records import (
 from slatprep.sample import sample
 from slatprep.storage.faults import reached
 from slatprep.storage.states import noting
-from slatprep.store.record import AssetRecord, FailedRecord
+from slatprep.store.record import AssetRecord, FailedRecord, NotIn
 from slatprep.store.record_json import faults_of
 
 _REASON, _TRACEBACK = 4_000, 100_000
@@ -75,8 +74,7 @@ def process_asset(
     latents = read_latents(pair)
     reached("asset read", pair.asset_id)
     before = (known.alignment, known.judgement) if known else ()
-    one = annotate(pair, field, latents, parameters, *before)
-    return Finished(pair, field, latents, one.alignment, one.annotation, one.judgement)
+    return annotate(pair, field, latents, parameters, *before)
 
 
 def finish_asset(
@@ -106,7 +104,7 @@ def finish_asset(
         # A fault in one asset, even of slatprep's own, must not cost the others.
         if context.strict:
             raise
-        return record_of_failed(_failure(pair, error), context.recipe)
+        return record_of_failed(pair, context.recipe, *_why(error))
     if planned.action is not Action.REUSE or planned.key != key:  # It changed since the plan.
         damaged = ""
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
@@ -118,7 +116,7 @@ def fail_asset(pair: AssetPair, planned: PlannedAsset, context: BuildContext) ->
     reason = "its worker process was killed twice, probably because memory ran out"
     if context.strict:
         raise SlatprepError(f"{pair.asset_id}: {reason}")
-    return record_of_failed(Failed(pair, Status.FAILED, reason), context.recipe)
+    return record_of_failed(pair, context.recipe, reason)
 
 
 def _repeated(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> Finished | None:
@@ -152,8 +150,8 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
     return found and replace(found[1], seen=planned.seen)
 
 
-def _failure(pair: AssetPair, error: Exception) -> Failed:
-    """Say why an asset cannot go in, in one line, and where slatprep itself is at fault."""
+def _why(error: Exception) -> tuple[str, str, NotIn]:
+    """Say why an asset cannot go in, in one line, where slatprep itself is at fault, and how."""
     line, trace = " ".join(str(error).split()), ""
     if len(line) > _REASON:
         line = f"{line[:_REASON]} ..."
@@ -163,7 +161,7 @@ def _failure(pair: AssetPair, error: Exception) -> Failed:
         line = f"internal error, please report: {type(error).__name__}: {line}"
         trace = traceback.format_exc()[-_TRACEBACK:]
     missing = isinstance(error, MissingPartnerError)
-    return Failed(pair, Status.SKIPPED if missing else Status.FAILED, line, trace)
+    return line, trace, Status.SKIPPED if missing else Status.FAILED
 
 
 WHEN = (

@@ -30,7 +30,6 @@ from slatprep.readers.splits import read_id_file
 from slatprep.records import (
     AssetPair,
     Contents,
-    Failed,
     Finished,
     Normalization,
     SourceFile,
@@ -42,6 +41,7 @@ from slatprep.store.record import (
     MAX_WARNINGS,
     AssetRecord,
     FailedRecord,
+    NotIn,
     StageParameters,
     VoxelCounts,
 )
@@ -208,14 +208,16 @@ def _first(warnings: tuple[str, ...]) -> tuple[str, ...]:
     return (*kept, f"{len(warnings) - len(kept):,} more warnings")
 
 
-def record_of_failed(asset: Failed, recipe: Recipe) -> FailedRecord:
-    """Return the record of an asset that cannot go in."""
-    return FailedRecord(
-        **_said_of(asset.pair, recipe),
-        status=asset.status,
-        reason=asset.reason,
-        traceback=asset.traceback,
-    )
+def record_of_failed(
+    pair: AssetPair,
+    recipe: Recipe,
+    reason: str,
+    traceback: str = "",
+    status: NotIn = Status.FAILED,
+) -> FailedRecord:
+    """Return the record of an asset that cannot go in, and why; `traceback` is of our own fault."""
+    said = _said_of(pair, recipe)
+    return FailedRecord(**said, reason=reason, traceback=traceback, status=status)
 
 
 def _said_of(pair: AssetPair, recipe: Recipe) -> dict[str, Any]:

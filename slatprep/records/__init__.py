@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as with_default
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from annotated_types import MaxLen, MinLen
@@ -162,7 +162,7 @@ class Normalization:
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """An asset that went through all stages; properties in SI units.
+    """An asset, or one of its several annotations, that went through all stages; in SI units.
 
     If merged of several annotations, it has a contribution for each. It also has the files of all,
     with their digests by role for the asset's key, and the fields after the first. Field and
@@ -179,16 +179,3 @@ class Finished:
     sources: tuple[SourceFile, ...] = ()
     digests: Mapping[str, str] = with_default(default_factory=dict)
     others: tuple[MaterialField, ...] = ()
-
-
-@dataclass(frozen=True)
-class Failed:
-    """An asset that cannot go in.
-
-    ``reason`` says why in a line; ``traceback`` says where, if slatprep itself is at fault.
-    """
-
-    pair: AssetPair
-    status: Literal[Status.FAILED, Status.SKIPPED]
-    reason: str
-    traceback: str = ""

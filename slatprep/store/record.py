@@ -169,6 +169,10 @@ class AssetRecord:
         )
 
 
+NotIn = Literal[Status.FAILED, Status.SKIPPED]
+"""Status of an asset that is not in the store."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FailedRecord:
     """Why an asset is not in the store."""
@@ -185,7 +189,7 @@ class FailedRecord:
     """Image or seed the SLAT was made from; empty where there is one only."""
     category: str
     """PixieVerse category; empty where unknown."""
-    status: Literal[Status.FAILED, Status.SKIPPED]
+    status: NotIn
     """``skipped`` where a partner is missing, ``failed`` otherwise."""
     reason: Annotated[str, MinLen(1)]
     """Why the asset did not go in, in one line."""

@@ -13,7 +13,7 @@ from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.notices import nothing_usable, wild_ranges
 from slatprep.pipeline.publish import BuildSummary, counts_of, summarise
 from slatprep.pipeline.recipe import recipe_of, record_of_failed
-from slatprep.records import AssetPair, Failed, SourceRoots, Status
+from slatprep.records import AssetPair, SourceRoots, Status
 from slatprep.store.record import FailedRecord
 
 USUAL = ((3.2, 10.8), (1.8, 3.8), (0.21, 0.45))
@@ -82,7 +82,7 @@ PARAMETERS = BuildParameters(PixieverseSource(Path("/grids")), SlatSource(Path("
 
 def failed(number: int, status: Status = Status.FAILED) -> FailedRecord:
     pair = AssetPair(f"a{number:03d}", "", "", "", SourceRoots(Path(), Path()), *[None] * 4)
-    return record_of_failed(Failed(pair, status, f"reason {number}"), recipe_of(PARAMETERS))
+    return record_of_failed(pair, recipe_of(PARAMETERS), f"reason {number}", status=status)
 
 
 def summed_up(without: list[FailedRecord], **verdicts: str) -> BuildSummary:
