@@ -51,6 +51,7 @@ SOLID = [
 HARD = [TABLE[0], {"name": "hardness", "unit": "1", "scale": "linear"}]
 NAMES = [str(one["name"]) for one in TABLE]
 KNOWN = AlignParameters(engine=Engine.KNOWN)
+STRICT = SampleParameters("nearest", max_unphysical=1)
 
 
 def voxels_of(seed: int, slabs: int = 0) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
@@ -109,13 +110,9 @@ def parameters_of(
     """Return the parameters of a build, with frames that are known where they are named."""
     if transform:
         groups["align"] = KNOWN
-    return BuildParameters(
-        PixieverseSource(root / "voxels", adapter=adapter, transform=transform),
-        SlatSource(root / "slat"),
-        sample=SampleParameters(method="nearest"),
-        store=SMALL_SHARDS,
-        **groups,  # type: ignore[arg-type]
-    )
+    source = PixieverseSource(root / "voxels", adapter=adapter, transform=transform)
+    usual = {"sample": SampleParameters("nearest"), "store": SMALL_SHARDS}
+    return BuildParameters(source, SlatSource(root / "slat"), **usual | groups)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("form", "classes"), [("npz", True), ("hdf5", False)])
@@ -160,8 +157,7 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form,
     about = json.loads((tmp_path / "voxels" / "source.json").read_text())
     about["properties"][2]["most"] = 1.0
     (tmp_path / "voxels" / "source.json").write_text(json.dumps(about))
-    strict = replace(parameters_of(tmp_path), sample=SampleParameters("nearest", max_unphysical=1))
-    assert build_store(strict, out).n_unphysical > 0
+    assert build_store(parameters_of(tmp_path, sample=STRICT), out).n_unphysical > 0
 
 
 def test_without_classes_no_accuracy_is_claimed(tmp_path):
@@ -309,7 +305,7 @@ def test_every_file_that_decides_an_asset_is_looked_at_again(tmp_path):
     frame.write_text(json.dumps(QUARTER_TURN.tolist()))
     about = tmp_path / "voxels" / "source.json"
     about.write_text(about.read_text().replace('"most": 90', '"most": 1'))
-    strict = replace(parameters, sample=SampleParameters("nearest", max_unphysical=1))
+    strict = replace(parameters, sample=STRICT)
     assert build_store(strict, out).n_unphysical > 0
     about.write_text(about.read_text().replace('"most": 1', '"most": 90'))
     assert build_store(strict, out).n_unphysical == 0
@@ -373,13 +369,13 @@ def test_properties_next_to_the_border_of_two_labels_are_verified(tmp_path):
     assert not verify_store(str(out)).findings
 
 
-def named(count: int) -> list[str]:
+def class_names(count: int) -> list[str]:
     return [f"class {k}" for k in range(count)]
 
 
 def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
     out = tmp_path / "s.zarr"
-    write(tmp_path, "ab", classes=named(254), properties=HARD, slabs=254)
+    write(tmp_path, "ab", classes=class_names(254), properties=HARD, slabs=254)
     build_store(parameters_of(tmp_path), out)
     store = open_store(out)
     assert store.contents.n_classes == 254
@@ -399,7 +395,7 @@ def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
         assert asset.valid.all()
         assert check_alignment(store, asset.asset_id).ok
     found = store_statistics(store)
-    assert [one.name for one in found.classes] == named(254)
+    assert [one.name for one in found.classes] == class_names(254)
     for k, one in enumerate(found.classes):
         assert one.field.voxels == counts[k]
     assert found.total.field.unannotated == found.total.slat.unannotated == 0
@@ -410,12 +406,14 @@ def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
 
 def test_nine_classes_and_other_properties_go_all_the_way_to_scores(tmp_path):
     out, trained = tmp_path / "s.zarr", tmp_path / "run"
-    write(tmp_path, "abcdefgh", classes=named(9), properties=HARD, slabs=9)
-    passes = {
-        "consensus": ConsensusParameters(settle=True),
-        "witness": WitnessParameters(settle=True),
-    }
-    build_store(replace(parameters_of(tmp_path, **passes), sample=SampleParameters()), out)
+    write(tmp_path, "abcdefgh", classes=class_names(9), properties=HARD, slabs=9)
+    passed = parameters_of(
+        tmp_path,
+        sample=SampleParameters(),
+        consensus=ConsensusParameters(settle=True),
+        witness=WitnessParameters(settle=True),
+    )
+    build_store(passed, out)
     store = open_store(out)
     assert store.contents.background == 254
     assert not verify_store(out).findings
@@ -475,7 +473,7 @@ def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equ
 
 
 def test_more_than_a_byte_holds_are_refused_in_words(tmp_path):
-    write(tmp_path, "a", classes=named(255), properties=HARD, slabs=255)
+    write(tmp_path, "a", classes=class_names(255), properties=HARD, slabs=255)
     with pytest.raises(ConfigError, match="there are 255 classes, not 1 to 254"):
         build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
 
