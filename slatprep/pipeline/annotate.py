@@ -130,7 +130,7 @@ def _annotations(
     faults: dict[str, InputError] = {}
     for one in pair.annotations:
         try:
-            field = read_field(one, parameters.sample.max_unphysical)
+            field = _in_order(read_field(one, parameters.sample.max_unphysical), pair)
         except InputError as error:
             faults[one.sample] = error
             continue
@@ -152,6 +152,14 @@ def _annotations(
         reasons = [f"sample {sample}: {error}" for sample, error in faults.items()]
         raise _unusable(pair, what, reasons, "one that can be")
     return annotated, faults
+
+
+def _in_order(field: MaterialField, pair: AssetPair) -> MaterialField:
+    """Return a field with the properties that it has in the order of the store's."""
+    own = [one.name for one in field.table]
+    columns = [own.index(p.name) for p in pair.roots.contents.properties if p.name in own]
+    table = tuple(field.table[column] for column in columns)
+    return replace(field, properties=field.properties[:, columns], table=table)
 
 
 def _warnings(

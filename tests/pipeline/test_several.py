@@ -30,6 +30,7 @@ DENSER, STIFFER = 4.0, 3.0
 """What the second source makes of the density, the third of Young's modulus."""
 
 DENSITY = {"name": "density", "unit": "kg/m^3", "scale": "log10"}
+MODULUS = {"name": "youngs_modulus", "unit": "Pa", "scale": "log10"}
 
 
 def asked(dataset: Dataset, samples: Samples = "merge", ranges: str = "dataset") -> BuildParameters:
@@ -273,6 +274,23 @@ def test_what_fails_is_left_out_and_named_and_an_asset_fails_when_none_is_left(o
     # What is left must have all that the store holds.
     assert "sample also_1 has no youngs_modulus, poissons_ratio, classes" in problems["b"]
     assert "sample also_2.0: " in problems["b"]
+
+
+def test_columns_are_the_store_s_in_whatever_order_the_first_source_has_them(own, plain, tmp_path):
+    """The file of the source whose order the store has is torn."""
+    (own.root / "pixieverse/b/sample_0/material_grid.npy").write_bytes(b"torn")
+    turned = [DENSITY, MODULUS, {"name": "poissons_ratio", "unit": "1", "scale": "linear"}]
+    describe(own.root, properties=turned, classes=True)
+    grid = make_asset(1).grid
+    voxels = np.argwhere(grid[..., 3] != 7)
+    density, modulus, ratio, material = grid[tuple(voxels.T)].T
+    arrays = {"density": density, "youngs_modulus": modulus, "poissons_ratio": ratio}
+    np.savez(own.root / "second/b.npz", voxels=voxels, material=material.astype(int), **arrays)
+    out = build_store(replace(asked(own), also=asked(own).also[:1]), tmp_path / "s.zarr").store
+    asset, alone = open_store(out).asset("b"), open_store(plain.store).asset("b")
+    np.testing.assert_allclose(asset.properties_si, alone.properties_si, rtol=1e-5)
+    np.testing.assert_allclose(asset.field.properties, alone.field.properties, rtol=1e-5)
+    assert verify_store(out).findings == ()
 
 
 def test_a_change_in_any_annotation_redoes_that_object_alone(own, merged, tmp_path, aligned):
