@@ -24,10 +24,11 @@ from pathlib import Path
 
 import checkout  # noqa: F401 - says where the tests' support lies
 import numpy as np
-from support.published import CLASSES, SparseArchive, files
+from support.published import CLASSES, SparseArchive
 from support.published_hub import PublishedHub
 from support.raw_sources import npy
 from support.synthetic import Dataset, make_asset
+from support.trees import tree
 
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.published import wanted_members
@@ -188,7 +189,7 @@ def main() -> None:
     for what, requests, ranges, size, seconds in rows:
         print(f"| {what} | {requests} | {ranges} | {size:,} | {size / whole:.2%} | {seconds:.1f} |")
     print(f"| build from the disk | - | - | {local:,} | {local / whole:.2%} | - |")
-    same = [files(folder / f"{name}.zarr") == files(store) for name in ("unpacked", "local")]
+    same = [tree(folder / f"{name}.zarr") == tree(store) for name in ("unpacked", "local")]
     print()
     print(
         f"{given.objects} objects, archives of {whole:,} bytes with {given.frames} frames of "
