@@ -36,49 +36,31 @@ def test_names_that_are_not_utf_8_cost_their_assets_alone(make_dataset, tmp_path
     assert again.build_id == summary.build_id
 
 
-def test_a_sample_whose_name_is_not_utf_8_is_left_out_of_those_that_are_merged(
-    make_dataset, tmp_path
-):
-    dataset = make_dataset("a")
-    samples = dataset.root / "pixieverse/a"
-    shutil.copytree(samples / "sample_0", samples / f"sample_{BAD}")
-    parameters = dataset.parameters("pixie", pixieverse={"samples": "merge"})
-    summary = build_store(parameters, tmp_path / "s.zarr")
-    assert summary.statuses == {"ok": 1, "failed": 0, "skipped": 0}
-    used, left_out = StoredRecords(open_store(summary.store)).of("a").merged
-    assert (used.sample, used.left_out, left_out.sample) == ("0", "", "b\\udcff")
-    assert "is no UTF-8" in left_out.left_out
-    assert verify_store(summary.store).ok
-
-
-def test_a_category_that_is_no_text_is_written_out(make_dataset, tmp_path):
-    dataset = make_dataset("a")
-    categories = tmp_path / "categories.json"
-    categories.write_text('{"a": {"obj_class": "x\\ud800y"}}')
-    parameters = dataset.parameters(pairing={"categories": categories})
-    summary = build_store(parameters, tmp_path / "s.zarr")
-    assert open_store(summary.store).column("category").tolist() == ["x\\ud800y"]
-
-
+# Half a pair of surrogates, and what lies beyond Unicode.
 BOUNDS = {
-    "half a pair": np.array(["\ud800"]),
-    "beyond Unicode": np.array([0x7FFFFFFF], np.uint32).view("<U1"),
+    "half": np.array(["\ud800"]),
+    "beyond": np.array([0x7FFFFFFF], np.uint32).view("<U1"),
 }
 
 
-@pytest.mark.parametrize("case", BOUNDS)
-def test_bounds_that_are_no_text_are_left_out(make_dataset, tmp_path, case):
-    dataset = make_dataset("a")
-    np.savez(
-        dataset.root / "pixieverse/a/clip_features.npz",
-        model=BOUNDS[case],
-        min_bounds=np.full(3, -0.5, np.longdouble),
-        max_bounds=np.full(3, 0.5, ">f8"),
-    )
-    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    record = records_of(summary.records)["a"]
-    assert record["bounds"] == {"min_bounds": [-0.5] * 3, "max_bounds": [0.5] * 3}
-    assert "[model] is no text; left out" in record["warnings"][0]
+def test_what_is_no_text_is_written_out_or_left_out(make_dataset, tmp_path):
+    dataset, categories = make_dataset(*BOUNDS), tmp_path / "categories.json"
+    categories.write_text('{"half": {"obj_class": "x\\ud800y"}}')
+    for name, model in BOUNDS.items():
+        np.savez(
+            dataset.root / "pixieverse" / name / "clip_features.npz",
+            model=model,
+            min_bounds=np.full(3, -0.5, np.longdouble),
+            max_bounds=np.full(3, 0.5, ">f8"),
+        )
+    parameters = dataset.parameters(pairing={"categories": categories})
+    summary = build_store(parameters, tmp_path / "s.zarr")
+    store = open_store(summary.store)
+    assert store.ids == ["beyond", "half"]
+    assert store.column("category").tolist() == ["", "x\\ud800y"]
+    for record in records_of(summary.records).values():
+        assert record["bounds"] == {"min_bounds": [-0.5] * 3, "max_bounds": [0.5] * 3}
+        assert "[model] is no text; left out" in record["warnings"][0]
 
 
 def test_a_store_cannot_have_a_name_that_is_not_utf_8(make_dataset, tmp_path):
@@ -101,17 +83,22 @@ def test_a_root_that_is_not_utf_8_is_named(tmp_path):
         load_parameters(config)
 
 
-def test_more_annotations_than_a_record_holds_cost_their_asset_alone(make_dataset, tmp_path):
-    dataset = make_dataset("a", "b")
-    folder = dataset.root / "pixieverse" / "a"
-    for sample in range(1, 256):
-        (folder / f"sample_{sample}").mkdir()
-        grid = f"sample_{sample}/material_grid.npy"
-        os.link(folder / "sample_0/material_grid.npy", folder / grid)
+def test_bad_names_of_annotations_are_left_out_and_too_many_refused(make_dataset, tmp_path):
+    dataset = make_dataset("a", "b", "c")
+    grids = dataset.root / "pixieverse"
+    for name in ("a", "b"):
+        samples = [BAD] if name == "b" else range(1, 256)
+        for sample in samples:
+            (grids / name / f"sample_{sample}").mkdir()
+            grid = f"sample_{sample}/material_grid.npy"
+            os.link(grids / name / "sample_0/material_grid.npy", grids / name / grid)
     parameters = dataset.parameters("pixie", pixieverse={"samples": "merge"})
     summary = build_store(parameters, tmp_path / "s.zarr")
-    assert (summary.statuses["ok"], summary.statuses["failed"]) == (1, 1)
+    assert summary.statuses == {"ok": 2, "failed": 1, "skipped": 0}
     assert "256 annotations in 257 files" in dict(summary.problems)["a"]
+    used, left_out = StoredRecords(open_store(summary.store)).of("b").merged
+    assert (used.sample, used.left_out, left_out.sample) == ("0", "", "b\\udcff")
+    assert "is no UTF-8" in left_out.left_out
     assert verify_store(tmp_path / "s.zarr").ok
 
 

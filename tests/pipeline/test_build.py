@@ -76,14 +76,6 @@ def stop(*reached: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_a_build_that_is_stopped_midway_leaves_the_old_store(built):
-    dataset, out = built
-    before = tree(out.parent)
-    with pytest.raises(KeyboardInterrupt):
-        build_store(dataset.parameters("pixie"), out, progress=stop)
-    assert before.items() <= tree(out.parent).items()
-
-
 @pytest.mark.parametrize("step", ["work folder made", "work folder locked"])
 def test_a_build_that_is_stopped_as_it_begins_leaves_nothing(
     make_dataset, tmp_path, monkeypatch, step

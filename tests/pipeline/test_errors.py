@@ -45,19 +45,14 @@ def test_decoys_are_of_other_objects_and_are_aligned_once(store):
     assert told_of(store) == first.sentences()
 
 
-def test_more_decoys_take_over_those_there_are_and_another_seed_draws_others(store):
-    keys = {asset_id: asset_id for asset_id in store.ids}
-    few, more = (draw_decoys(store, keys, count, 1) for count in (2, 4))
-    assert more[:2] == few
-    assert [one.grid for one in draw_decoys(store, keys, 9, 2)] != [
-        one.grid for one in draw_decoys(store, keys, 9, 1)
-    ]
-
-
-def test_the_slat_is_of_the_size_that_is_nearest(store):
+def test_decoys_are_drawn_by_ids_and_seed_with_the_slat_of_the_nearest_size(store):
+    keys = dict.fromkeys(store.ids, "")
+    few, more, drawn = (draw_decoys(store, keys, count, 1) for count in (2, 4, 100))
+    assert drawn[:4] == more and more[:2] == few
+    assert [one.grid for one in draw_decoys(store, keys, 100, 2)] != [one.grid for one in drawn]
     sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
     objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
-    for one in draw_decoys(store, dict.fromkeys(store.ids, ""), 100, 0):
+    for one in drawn:
         others = [other for other in store.ids if objects[other] != objects[one.grid]]
         nearest = min(abs(sizes[other] - sizes[one.grid]) for other in others)
         assert abs(sizes[one.slat] - sizes[one.grid]) == nearest
@@ -75,10 +70,23 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
     assert picture == draw_errors(found, store.name)
 
 
-def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store):
-    measured = measure_errors(store, decoys=3, seed=1)
+def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_path):
+    options = ("--decoys", 3, "--seed", 1, "--picture", tmp_path / "errors.svg")
+    found = json.loads(run("measure-errors", store.path, *options, "--json").stdout)
+    assert found["decoys"] == 3 and found["assets"] == len(store)
+    assert set(found["errors"]) <= set(store.ids)
+    assert (tmp_path / "errors.svg").read_text().startswith("<?xml")
+    measured, asset_id = measured_errors(store.path), store.ids[0]
+    assert measured is not None
     shown = run("info", store.path)
     assert all(sentence in shown.output for sentence in measured.sentences())
+    words = ("check-alignment", "--asset", asset_id, "--store", store.path, "--picture", "none")
+    assert measured.of_asset(asset_id) in run(*words).output
+    (found,) = json.loads(run(*words, "--json").stdout)["assets"]
+    assert found["another_object"] == measured.errors.get(asset_id, 0.0)
+    assert "is below 0.1%" in replace(measured, errors={}).of_asset(asset_id)
+    assert "is 25.0%" in replace(measured, errors={asset_id: 0.25}).of_asset(asset_id)
+
     file = manifests_of(store.path) / FILE
     document = json.loads(file.read_bytes())
     file.write_text(json.dumps(document | {"build": "another"}))
@@ -87,28 +95,6 @@ def test_info_repeats_what_was_measured_and_says_where_that_is_of_before(store):
     file.write_text("{")
     assert measured_errors(store.path) is None
     assert told_of(store) == ["not measured; decoys need 50 assets"]
-
-
-def test_the_command_says_how_many_are_wrong(store, tmp_path):
-    picture = tmp_path / "errors.svg"
-    options = ("--decoys", 3, "--seed", 1, "--picture", picture)
-    shown = run("measure-errors", store.path, *options, "--json")
-    found = json.loads(shown.stdout)
-    assert found["decoys"] == 3 and found["assets"] == len(store)
-    assert set(found["errors"]) <= set(store.ids)
-    assert picture.read_text().startswith("<?xml")
-
-
-def test_an_asset_is_told_its_probability_of_an_error(store):
-    measured = measure_errors(store, decoys=3, seed=1)
-    asset_id = store.ids[0]
-    words = ("check-alignment", "--asset", asset_id, "--store", store.path, "--picture", "none")
-    assert measured.of_asset(asset_id) in run(*words).output
-    shown = run(*words, "--json")
-    (found,) = json.loads(shown.stdout)["assets"]
-    assert found["another_object"] == measured.errors.get(asset_id, 0.0)
-    assert "is below 0.1%" in replace(measured, errors={}).of_asset(asset_id)
-    assert "is 25.0%" in replace(measured, errors={asset_id: 0.25}).of_asset(asset_id)
 
 
 OBJECTS = ("ant", "bear", "cup", "dog", "eel", "fox")

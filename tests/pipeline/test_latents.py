@@ -2,12 +2,12 @@
 
 import json
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.made_store import edit_attributes
 from support.synthetic import Dataset, MakeDataset
+from support.trees import records_beside, records_of
 
 from slatprep import build_store, concat_stores, export_store, open_store
 from slatprep.errors import InputError, StoreError
@@ -73,15 +73,10 @@ def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tm
         np.testing.assert_allclose(file["feats"], raw["a"], atol=1e-5)
 
     # Said outright, nobody warns; said wrongly, it is done as said.
-    assert (
-        of_latents(build_store(dataset.parameters(slat={"standardised": "yes"}), out).warnings)
-        == []
-    )
-    assert open_store(out).contents.latents.standardised
-    assert (
-        of_latents(build_store(dataset.parameters(slat={"standardised": "no"}), out).warnings) == []
-    )
-    assert not open_store(out).contents.latents.standardised
+    for said in ("yes", "no"):
+        summary = build_store(dataset.parameters(slat={"standardised": said}), out)
+        assert of_latents(summary.warnings) == []
+        assert open_store(out).contents.latents.standardised == (said == "yes")
 
 
 def test_one_asset_unlike_the_others_is_named(dataset, tmp_path):
@@ -91,9 +86,8 @@ def test_one_asset_unlike_the_others_is_named(dataset, tmp_path):
     warnings = of_latents(summary.warnings)
     assert len(warnings) == 1
     assert "1 of 6 assets look standardised already, unlike the others (c)" in warnings[0]
-    lines = Path(str(summary.records)).read_text().splitlines()
-    warned = [record["asset_id"] for record in map(json.loads, lines) if record["warnings"]]
-    assert warned == ["c"]
+    records = records_of(summary.records)
+    assert [name for name, record in records.items() if record["warnings"]] == ["c"]
 
 
 def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path):
@@ -186,8 +180,7 @@ def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
     space = store.contents.latents
     assert (space.encoder, space.channels, len(space.std)) == ("trellis2-shape-pbr", 64, 64)
     assert (space.mean[0], space.mean[32]) == (0.781296, 3.501659)
-    files = [json.loads(line)["sources"] for line in (tmp_path / "s.manifests/assets.jsonl").open()]
-    paths = {(file["role"], file["path"]) for file in files[0]}
+    paths = {(file["role"], file["path"]) for file in records_beside(out)["a"]["sources"]}
     assert ("texture", "pbr_latents/tex_enc_1024/a.npz") in paths
     assert verify_store(out, sources=True).ok
     # Texture that changes alone is noticed.

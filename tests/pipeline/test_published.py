@@ -1,7 +1,6 @@
 """A store of PixieVerse as it is published is that of the unpacked folders."""
 
 import hashlib
-import json
 import shutil
 import tarfile
 import zlib
@@ -10,7 +9,7 @@ from pathlib import Path
 import pytest
 from support.published import IDS, add, pack, parameters, write_object
 from support.synthetic import make_asset
-from support.trees import tree
+from support.trees import records_of, tree
 
 from slatprep.errors import InputError
 from slatprep.inspect.verify import verify_store
@@ -130,10 +129,8 @@ def test_what_changed_in_an_archive_is_built_again_alone(objects, made, tmp_path
     shutil.copytree(objects / IDS[0], tmp_path / "new" / IDS[0])
     write_object(tmp_path / "new" / IDS[3], make_asset(3).grid * [1, 2, 1, 1], 3)
     pack(folder / "archives/render_outputs/tree.tar", sorted((tmp_path / "new").iterdir()))
-    build_store(parameters(made, folder), tmp_path / "s.zarr")
+    assert build_store(parameters(made, folder), tmp_path / "s.zarr").statuses["ok"] == 4
     build_store(parameters(made, folder), tmp_path / "fresh.zarr")
-    records = json.loads((tmp_path / "s.manifests" / "build.json").read_text())
-    assert records["statuses"]["ok"] == 4
     assert tree(tmp_path / "s.zarr") == tree(tmp_path / "fresh.zarr")
 
 
@@ -169,9 +166,9 @@ def test_last_of_two_members_counts_and_links_lead_within_the_archive(
     told: list[str] = []
     summary = build_store(parameters(made, strange), tmp_path / "s.zarr", note=told.append)
     problems = dict(summary.problems)
-    records = [json.loads(line) for line in (tmp_path / "s.manifests" / "assets.jsonl").open()]
     digest = hashlib.sha256(grid_of(objects, 0).read_bytes()).hexdigest()
-    grids = {r["asset_id"]: r["sources"][0]["sha256"] for r in records if r["status"] == "ok"}
+    records = records_of(summary.records)
+    grids = {name: r["sources"][0]["sha256"] for name, r in records.items() if "sources" in r}
     assert grids == {IDS[0]: digest, IDS[1]: digest}
     (line,) = [line for line in told if "twice" in line]
     assert "tree.tar: 1 name" in line and "'/etc/passwd' and 1 more" in line

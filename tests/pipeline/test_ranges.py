@@ -16,10 +16,10 @@ from slatprep.store import open_store
 from slatprep.store.record_json import read_build_record
 
 
-def noisy(dataset: Dataset, *names: str) -> Dataset:
+def noisy(dataset: Dataset) -> Dataset:
     """Give every voxel properties of its own, over decades, with ties and zeros among them."""
     rng = np.random.default_rng(7)
-    for number, name in enumerate(names):
+    for number, name in enumerate(dataset.assets):
         grid = dataset.assets[name].grid
         inside = grid[..., 3] != 7
         count = int(inside.sum())
@@ -48,7 +48,7 @@ def of(dataset: Dataset, **normalize: object) -> BuildParameters:
 
 
 def test_percentiles_are_numpy_s_whatever_the_jobs_and_what_was_there(make_dataset, tmp_path):
-    dataset, out = noisy(make_dataset("a", "b", "c"), "a", "b", "c"), tmp_path / "s.zarr"
+    dataset, out = noisy(make_dataset(*"abc")), tmp_path / "s.zarr"
     for lo, hi in ((0, 100), (0.5, 97.25), (1, 99)):
         build_store(of(dataset, ranges=f"p{lo}-p{hi}"), out)
         np.testing.assert_allclose(ranges_of(out), expected(dataset, "abc", lo, hi), rtol=1e-12)
@@ -58,7 +58,7 @@ def test_percentiles_are_numpy_s_whatever_the_jobs_and_what_was_there(make_datas
 
 
 def test_an_object_of_several_views_counts_once(make_dataset, tmp_path):
-    dataset, out = noisy(make_dataset("a", "b"), "a", "b"), tmp_path / "s.zarr"
+    dataset, out = noisy(make_dataset(*"ab")), tmp_path / "s.zarr"
     shape = dataset.assets["b"]
     for view in ("front", "side"):
         dataset.write_slat(f"b/{view}.npz", shape.coords, shape.feats)
@@ -70,7 +70,7 @@ def test_an_object_of_several_views_counts_once(make_dataset, tmp_path):
 
 @pytest.mark.parametrize(("ranges", "bounds"), [("p1-p99", (1, 99)), ("dataset", (0, 100))])
 def test_ranges_of_the_objects_to_train_on(make_dataset, tmp_path, ranges, bounds):
-    dataset, out = noisy(make_dataset("a", "b", "c"), "a", "b", "c"), tmp_path / "s.zarr"
+    dataset, out = noisy(make_dataset(*"abc")), tmp_path / "s.zarr"
     lists = tmp_path / "lists.json"
     lists.write_text(json.dumps({"train": ["a", "b"], "test": ["c"]}))
     chosen = of(dataset, ranges=ranges, objects="train", split_by=str(lists))
@@ -97,7 +97,7 @@ def test_by_hash_the_training_s_own_objects_count(make_dataset, tmp_path):
     from slatprep.readers.splits import Shares
 
     names = "abcdef"
-    dataset, out = noisy(make_dataset(*names), *names), tmp_path / "s.zarr"
+    dataset, out = noisy(make_dataset(*names)), tmp_path / "s.zarr"
     shares = (0.5, 0.25, 0.25)
     build_store(of(dataset, ranges="p1-p99", objects="train", shares=shares), out)
     trained = assign_store(open_store(out), "hash", Shares(*shares)).lists()["train"]

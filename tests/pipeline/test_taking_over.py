@@ -134,25 +134,28 @@ def other_latents(dataset: Dataset) -> None:
 
 
 UPDATES = {
-    "new and last": (lambda dataset: dataset.add("h", 1), "h", "", 9),
-    "other latents": (other_latents, "c", "", 4),
-    "removed": (lambda dataset: dataset.remove("e"), "", "", 4),
-    "other ranges": (stiffer, "h", "aceg", 0),
+    "new and last": (lambda dataset: dataset.add("h", 1), {"h": "not in the store"}, "", 9),
+    "other latents": (other_latents, {"c": "sources changed: slat"}, "", 4),
+    "removed": (lambda dataset: dataset.remove("e"), {"e": "no longer among the sources"}, "", 4),
+    "other ranges": (stiffer, {"h": "not in the store"}, "aceg", 0),
 }
-"""By name: a change, the assets that are aligned and reused, and the least shards that stay."""
+"""By name: a change, what is said of it, the assets that are reused, the least shards that stay."""
 
 
 @pytest.mark.parametrize("case", UPDATES)
 def test_an_update_costs_what_changed_and_gives_the_bytes_of_a_first_build(built, steps, case):
     dataset, out = built
-    change, aligned, reused, least = UPDATES[case]
+    change, why, reused, least = UPDATES[case]
     before = inodes(out)
     change(dataset)
+    plan = plan_build(dataset.parameters(), out)
+    assert {one.asset_id: one.reason for one in plan.assets if one.action != "reuse"} == why
+    aligned = [one.asset_id for one in plan.assets if one.action == "align"]
     steps.clear()
     build_store(dataset.parameters(), out)
-    assert names(steps, "asset aligned") == list(aligned)
+    assert names(steps, "asset aligned") == aligned
     assert sorted(names(steps, "asset reused")) == list(reused)
-    assert sorted(names(steps, "asset read")) == sorted(aligned + reused)
+    assert sorted(names(steps, "asset read")) == sorted([*aligned, *reused])
     shards = {name for name in before if name.startswith("voxel/feats/c/")}
     assert least <= same_files(before, inodes(out), "voxel/feats/c/") < len(shards)
     assert tree(out) == tree_from_nothing(dataset.parameters())

@@ -54,28 +54,6 @@ def test_nothing_changed_writes_nothing_and_a_change_that_keeps_size_and_times_i
     assert reasons(dataset.parameters(), out)["a"] == ("align", "sources changed: slat")
 
 
-def test_new_changed_and_removed(built, aligned):
-    dataset, out = built
-    dataset.add("d", seed=3)
-    made = make_asset(seed=6)
-    dataset.write_slat("b.npz", made.coords, made.feats + 1)
-    dataset.write_grid("b", made.grid)
-    dataset.remove("c")
-    # Times say nothing: what is touched is not changed.
-    for path in dataset.root.rglob("a*.npz"):
-        path.touch()
-    assert reasons(dataset.parameters(), out) == {
-        "a": ("reuse", "unchanged"),
-        "b": ("align", "sources changed: grid, slat"),
-        "c": ("remove", "no longer among the sources"),
-        "d": ("align", "not in the store"),
-    }
-    build_store(dataset.parameters(), out)
-    assert len(aligned) == 2
-    assert open_store(out).ids == ["a", "b", "d"]
-    assert tree(out) == tree_from_nothing(dataset.parameters())
-
-
 @pytest.mark.parametrize("what", ["ranges", "shards"])
 def test_other_ranges_and_shards_need_no_alignment(built, aligned, what):
     dataset, out = built

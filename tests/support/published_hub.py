@@ -5,6 +5,7 @@ import json
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -78,7 +79,7 @@ class _Handler(BaseHTTPRequestHandler):
         if hub.refused:
             hub.refused -= 1
             hub.refusals.append(time.monotonic())
-            return self._error(429, "", path, {"Retry-After": str(hub.wait)})
+            return self._error(429, "", path, hub.wait)
         if parts[:2] == ["api", "datasets"]:
             return self._api("/".join(parts[2:4]), parts[4:], path)
         if parts[0] == "datasets" and parts[3] == "resolve":
@@ -127,12 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _file(self, name: str, revision: str, file: str, path: str) -> None:
         hub = self.server
         if hub.elsewhere is not None:
-            hub.count(self.command, path, 0)
-            self.send_response(302)
-            self.send_header("Location", f"{hub.elsewhere.address}{self.path}")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-            return
+            return self._answer(302, path, {"Location": f"{hub.elsewhere.address}{self.path}"})
         try:
             sha, folder = self._commit(name, revision)
             size = (folder / file).stat().st_size
@@ -144,50 +140,44 @@ class _Handler(BaseHTTPRequestHandler):
             begin, end = int(first), min(int(last) + 1 if last else size, size)
             if begin >= size:
                 return self._error(416, "", path)
-        self.send_response(206 if asked else 200)
-        self.send_header("Content-Length", str(end - begin))
-        self.send_header("ETag", f'"{_tag(folder / file)}"')
-        self.send_header("X-Linked-ETag", f'"{_tag(folder / file)}"')
-        self.send_header("X-Repo-Commit", sha)
+        tag = f'"{_tag(folder / file)}"'
+        headers = {"ETag": tag, "X-Linked-ETag": tag, "X-Repo-Commit": sha}
         if asked:
-            self.send_header("Content-Range", f"bytes {begin}-{end - 1}/{size}")
-        self.end_headers()
-        if self.command == "HEAD":
-            return hub.count("HEAD", path, 0)
-        cut = hub.cut > 0
-        hub.cut -= cut
+            headers["Content-Range"] = f"bytes {begin}-{end - 1}/{size}"
         with (folder / file).open("rb") as stream:
             stream.seek(begin)
-            sent = self._send(stream, (end - begin) // 2 if cut else end - begin)
-        hub.count("GET", path, sent)
-        self.close_connection |= cut
-
-    def _send(self, stream: BinaryIO, left: int) -> int:
-        sent = 0
-        while data := stream.read(min(left - sent, _PIECE)):
-            self.wfile.write(data)
-            sent += len(data)
-        self.wfile.flush()
-        return sent
+            self._answer(206 if asked else 200, path, headers, stream, end - begin)
 
     def _json(self, document: object, path: str) -> None:
         body = json.dumps(document).encode()
-        self.send_response(200)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-        self.server.count(self.command, path, len(body))
+        self._answer(200, path, {"Content-Type": "application/json"}, BytesIO(body), len(body))
 
-    def _error(self, status: int, code: str, path: str, more: dict[str, str] | None = None) -> None:
-        self.server.count(self.command, path, 0)
+    def _error(self, status: int, code: str, path: str, wait: int | None = None) -> None:
+        told = {"X-Error-Code": code, "Retry-After": "" if wait is None else str(wait)}
+        self._answer(status, path, {name: text for name, text in told.items() if text})
+
+    def _answer(
+        self,
+        status: int,
+        path: str,
+        headers: dict[str, str],
+        stream: BinaryIO | None = None,
+        size: int = 0,
+    ) -> None:
+        """Send so many bytes of a stream; of a range that is to be cut, half of them."""
         self.send_response(status)
-        for name, value in (more or {}).items():
+        for name, value in (headers | {"Content-Length": str(size)}).items():
             self.send_header(name, value)
-        if code:
-            self.send_header("X-Error-Code", code)
-        self.send_header("Content-Length", "0")
         self.end_headers()
+        sent, left, cut = 0, size, status == 206 and self.server.cut > 0
+        if cut:
+            self.server.cut -= 1
+            self.close_connection, left = True, size // 2
+        while self.command != "HEAD" and stream and (data := stream.read(min(left - sent, _PIECE))):
+            self.wfile.write(data)
+            sent += len(data)
+        self.wfile.flush()
+        self.server.count(self.command, path, sent)
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Say nothing."""
