@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.align.consensus import degrees_between
 from slatprep.geometry.frames import split_transform
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import canvas
@@ -242,7 +243,7 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y
             good = canvas.VERDICT_COLOURS["failed" if worse else "good"]
             canvas.write(figure, columns[2], line, mark, size=7.5, ha="right", color=good)
     rotation, shift, scale = split_transform(check.transform)
-    angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+    angle = degrees_between(rotation, np.eye(3))
     moved = np.linalg.norm(shift) * RESOLUTION
     words = f"turned {angle:.1f}°, shifted {moved:.2f} voxel, scaled {scale:.3f}"
     line = y + 36 + _LINE * len(rows)

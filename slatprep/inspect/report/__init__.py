@@ -21,7 +21,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from slatprep.errors import StoreError
-from slatprep.inspect.report.content import gather_outcomes, page_content
+from slatprep.inspect.report.content import Columns, build_of, page_content, told_by_records
 from slatprep.inspect.report.drawn import COARSE, FULL, PER_SHEET, Drawn, draw_asset, sheet
 from slatprep.inspect.tallies import Tally
 from slatprep.inspect.verify import WORDS
@@ -113,10 +113,10 @@ def write_report(
     _refuse_other_words(store)
     chosen = _chosen(store)
     listed = range(len(store)) if len(store) <= ASSETS_LISTED else chosen
-    outcomes = None
+    built, told = None, dict[int, Columns]()
     if manifests is not None:
-        names = {store.ids[row] for row in listed}
-        outcomes = gather_outcomes(manifests, store, names, ASSETS_LISTED)
+        built = build_of(manifests, store, ASSETS_LISTED)
+        told = told_by_records(store, listed)
     drawn: list[Drawn] = []
     tallies: dict[str, Tally] = {}
     categories = list(map(str, store.column("category")))
@@ -130,7 +130,7 @@ def write_report(
     drawn.sort(key=attrgetter("index"))
     full = sum(len(one.voxels[FULL]) for one in drawn)
     side = FULL if full <= VOXEL_BYTES else COARSE
-    content = page_content(store, outcomes, tallies, listed, drawn, side)
+    content = page_content(store, built, told, tallies, listed, drawn, side)
     with writing(str(out), Path(out).parent), staged(Path(out)) as temporary:
         with temporary.open("w", encoding="utf-8", newline="\n") as file:
             _write_page(file, content, drawn, side)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from slatprep.align.consensus import degrees_between
 from slatprep.align.starts import distinct_starts
 from slatprep.errors import StoreError
 from slatprep.geometry.frames import split_transform
@@ -25,7 +26,7 @@ from slatprep.normalize import PIXIE_RANGES
 from slatprep.pipeline.decoys import measured_errors, told_of
 from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Place, Status
 from slatprep.store.reader import Store
-from slatprep.store.record import AssetRecord
+from slatprep.store.record import AssetRecord, BuildRecord, FailedRecord
 from slatprep.store.records import StoredRecords, build_in
 
 # Matplotlib's viridis (CC0) at even steps: its lightness rises with the value, so that
@@ -55,35 +56,10 @@ Columns = dict[str, Any]
 """What the table on the page says of one asset, by the names of its columns."""
 
 
-@dataclass(frozen=True)
-class Outcomes:
-    """The outcomes of a build: each asset on the page, and how many are not in the store.
+def build_of(manifests: Place, store: Store, most_absent: int) -> BuildRecord:
+    """Return the record of a store's build, with at most so many assets that are not in it, by id.
 
-    Attributes
-    ----------
-    created : str
-        Day of the build.
-    stored : dict of str to Columns
-        By id, what records say of the assets of the store that the page lists.
-    absent : list of Columns
-        Assets that are not in the store, sorted by id.
-    states : Counter
-        All of those, by state.
-    """
-
-    created: str
-    stored: dict[str, Columns]
-    absent: list[Columns]
-    states: Counter[str]
-
-
-def gather_outcomes(
-    manifests: Place, store: Store, listed: Collection[str], most_absent: int
-) -> Outcomes:
-    """Gather the outcomes of a build from its records.
-
-    It keeps the assets `listed` and at most `most_absent` that are not in the store. StoreError if
-    the records cannot be read, belong to another build, or lack an asset of the store.
+    StoreError if it cannot be read, or is of another build.
     """
     build = build_in(manifests)
     if build.id != store.about.manifest:
@@ -91,23 +67,14 @@ def gather_outcomes(
             f"{manifests} holds the records of build {build.id[:12]!r}, the store was written by "
             f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests"
         )
-    records = (record for record in StoredRecords(store) if record.asset_id in listed)
-    failed = sorted(build.failed[:most_absent], key=lambda one: one.asset_id)
-    states = {state: build.statuses.get(str(status), 0) for status, state in _ABSENT.items()}
-    return Outcomes(
-        created=f"{build.created:%Y-%m-%d}",
-        stored={record.asset_id: _columns_of(record) for record in records},
-        absent=[
-            {
-                "id": one.asset_id,
-                "category": one.category,
-                "state": _ABSENT[one.status],
-                "reasons": [one.reason],
-            }
-            for one in failed
-        ],
-        states=+Counter(states),
-    )
+    absent = sorted(build.failed[:most_absent], key=lambda one: one.asset_id)
+    return replace(build, failed=tuple(absent))
+
+
+def told_by_records(store: Store, listed: Iterable[int]) -> dict[int, Columns]:
+    """Return what records say of assets, by their rows; StoreError if one cannot be read."""
+    records = StoredRecords(store)
+    return {row: _columns_of(records.read(row)) for row in listed}
 
 
 def _columns_of(record: AssetRecord) -> Columns:
@@ -154,7 +121,8 @@ def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
 
 def page_content(
     store: Store,
-    outcomes: Outcomes | None,
+    built: BuildRecord | None,
+    told: Mapping[int, Columns],
     tallies: Mapping[str, Tally],
     listed: Sequence[int],
     drawn: Sequence[Drawn],
@@ -162,21 +130,21 @@ def page_content(
 ) -> dict[str, Any]:
     """Return the content of a page, JSON-ready; NaN and unknown values are None.
 
-    `outcomes` come from the records, if any, and `tallies` count voxels by category. Rows `listed`
-    are in the table, those `drawn` also have a thumbnail and a 3D view with `side` voxels per edge;
-    both ascend. Columns of the table are lists over assets, those of the store first; ``all``
-    counts also assets outside it.
+    `built` and `told` come from the records, if any, and `tallies` count voxels by category. Rows
+    `listed` are in the table, those `drawn` also have a thumbnail and a 3D view with `side` voxels
+    per edge; both ascend. Columns of the table are lists over assets, those of the store first;
+    ``all`` counts also assets outside it.
     """
     build, labels = store.about.build, store.contents.labels
     states = Counter(map(str, store.column("verdict")))
-    if outcomes:
-        states += outcomes.states
+    if built:
+        states += Counter({name: built.statuses.get(str(of), 0) for of, name in _ABSENT.items()})
     return {
         "title": store.name,
         "name": build.name,
         "build_id": store.about.manifest,
-        "created": outcomes and outcomes.created,
-        "records": outcomes is not None,
+        "created": built and f"{built.created:%Y-%m-%d}",
+        "records": built is not None,
         "versions": build.versions,
         "parameters": [
             (f"{group}.{name}", json.dumps(value))
@@ -208,9 +176,9 @@ def page_content(
         },
         "errors": _errors(store),
         "turns": quarter_turns(),
-        "properties": _properties(store, outcomes, tallies),
+        "properties": _properties(store, tallies, clipped=built is not None),
         "balance": _balance(store, tallies),
-        "assets": _table(store, outcomes, listed, drawn),
+        "assets": _table(store, built.failed if built else (), told, listed, drawn),
         "all": {
             "stored": len(store),
             "assets": sum(states.values()),
@@ -233,9 +201,7 @@ def _errors(store: Store) -> dict[str, Any]:
     }
 
 
-def _properties(
-    store: Store, outcomes: Outcomes | None, tallies: Mapping[str, Tally]
-) -> list[dict[str, Any]]:
+def _properties(store: Store, tallies: Mapping[str, Tally], clipped: bool) -> list[dict[str, Any]]:
     """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
     total = sum(tallies.values(), start=no_tally(normalization, BINS, contents=store.contents))
@@ -248,7 +214,7 @@ def _properties(
             "pixie": [pixie.lo, pixie.hi] if (pixie := published.get(span.name)) else None,
             "field": field.tolist(),
             "slat": slat.tolist(),
-            "clipped": int(count) if outcomes else None,
+            "clipped": int(count) if clipped else None,
         }
         for span, one, field, slat, count in zip(
             normalization.ranges,
@@ -275,19 +241,25 @@ def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]
 
 
 def _table(
-    store: Store, outcomes: Outcomes | None, listed: Sequence[int], drawn: Sequence[Drawn]
+    store: Store,
+    absent: Sequence[FailedRecord],
+    told: Mapping[int, Columns],
+    listed: Sequence[int],
+    drawn: Sequence[Drawn],
 ) -> dict[str, list[Any]]:
     """Return the columns of the table of assets."""
     rows = np.array(listed, dtype=np.intp)
-    ids = [store.ids[row] for row in listed]
-    told = [outcomes.stored[asset_id] if outcomes else _UNTOLD for asset_id in ids]
-    absent = outcomes.absent if outcomes else []
+    of_records = [told.get(row, _UNTOLD) for row in listed]
+    of_absent = [
+        {"id": one.asset_id, "category": one.category, "state": _ABSENT[one.status],
+         "reasons": [one.reason]} for one in absent
+    ]  # fmt: skip
     transforms = store.column("transform")[rows]
     nearest = [nearest_quarter_turn(transform) for transform in transforms]
     pictures = {one.index: number for number, one in enumerate(drawn)}
     merged = {one.index: one for one in drawn if one.spreads}
     of_stored: dict[str, Iterable[Any]] = {
-        "id": ids,
+        "id": [store.ids[row] for row in listed],
         "category": map(str, store.column("category")[rows]),
         "state": map(str, store.column("verdict")[rows]),
         "voxels": np.diff(store.offsets)[rows].tolist(),
@@ -299,18 +271,20 @@ def _table(
             [round(float(value), 6) for value in matrix[:3].ravel()] for matrix in transforms
         ),
         **{
-            name: [own.get(name) for own in told]
+            name: [own.get(name) for own in of_records]
             for name in ("tied", "ties", "displacement", "reasons")
         },
         "picture": map(pictures.get, listed),
-        "annotations": (own.get("annotations") for own in told),
+        "annotations": (own.get("annotations") for own in of_records),
         "votes": (rounded(merged[row].votes) if row in merged else None for row in listed),
         "spreads": (
             list(map(rounded, merged[row].spreads)) if row in merged else None for row in listed
         ),
         **{name: map(rounded, store.column(name)[rows].tolist()) for name in _FIGURES},
     }
-    columns = {name: [*own, *(one.get(name) for one in absent)] for name, own in of_stored.items()}
+    columns = {
+        name: [*own, *(one.get(name) for one in of_absent)] for name, own in of_stored.items()
+    }
     kinds = kinds_of(reason for own in columns["reasons"] for reason in own)
     columns["kinds"] = [[kinds[reason] for reason in own] for own in columns["reasons"]]
     return columns
@@ -321,12 +295,10 @@ def nearest_quarter_turn(transform: ArrayLike) -> tuple[int, float]:
 
     The first is an index of `quarter_turns`, the second is in degrees.
     """
-    rotation, _, _ = split_transform(transform)
-    turns = np.stack([start.rotation for start in distinct_starts()])
-    traces = np.einsum("kij,ij->k", turns, rotation)
-    index = int(np.argmax(traces))
-    cosine = np.clip((traces[index] - 1.0) / 2.0, -1.0, 1.0)
-    return index, float(np.degrees(np.arccos(cosine)))
+    turns = [start.rotation for start in distinct_starts()]
+    angles = degrees_between(turns, split_transform(transform)[0])
+    index = int(angles.argmin())
+    return index, float(angles[index])
 
 
 def quarter_turns() -> tuple[str, ...]:
