@@ -90,53 +90,33 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
     contents, likely = asset.store.contents, asset.confidence
     classes, empty = contents.n_labels, contents.background
     known = np.isin(np.arange(256), (*range(classes), empty, UNANNOTATED))
-    sound = {
-        "voxel/coords": (np.diff(np.sort(flat_index(asset.coords, 256))) > 0).all(),
-        "voxel/feats": np.isfinite(asset.feats).all(),
-        "voxel/material": (np.where(valid, material < classes, material == UNANNOTATED)).all(),
-        "voxel/properties": _normalised(asset.properties.T, valid),
-        "voxel/distance": (asset.distance >= 0).all(),
-        "voxel/place": np.isfinite(asset.place).all(),
-        "voxel/confidence": ((likely >= 0) & (likely <= valid)).all(),
-        "voxel/spread": _is_spread(asset),
-        "voxel/votes": not asset.merged or (((votes > 0) == valid) & (votes <= 1)).all(),
-        "grid/material": known[grid].all(),
-        "grid/properties": _normalised(asset.grid_properties, grid < classes),
-    }
-    for where, fine in sound.items():
+    last, unfit = classes - 1, "a property that does not go with"
+    values: tuple[tuple[str, bool | np.bool_, str, str], ...] = (
+        ("voxel/coords", (np.diff(np.sort(flat_index(asset.coords, 256))) > 0).all(),
+         "a coordinate occurs twice", "each once"),
+        ("voxel/feats", np.isfinite(asset.feats).all(), "NaN or infinite", "finite latents"),
+        ("voxel/material", np.where(valid, material < classes, material == UNANNOTATED).all(),
+         "a class that does not go with valid", f"0 to {last} where valid, 255 elsewhere"),
+        ("voxel/properties", _normalised(asset.properties.T, valid),
+         f"{unfit} valid", "-1 to 1 where valid, NaN elsewhere"),
+        ("voxel/distance", (asset.distance >= 0).all(),
+         "negative or NaN", "a distance of 0 or more"),
+        ("voxel/place", np.isfinite(asset.place).all(), "NaN or infinite", "finite points"),
+        ("voxel/confidence", ((likely >= 0) & (likely <= valid)).all(),
+         "no probability, or one where there is no class", "0 to 1 where valid, 0 elsewhere"),
+        ("voxel/spread", _is_spread(asset),
+         "negative, or there where fewer than two annotations are",
+         "0 or more for all properties or NaN for all"),
+        ("voxel/votes", not asset.merged or (((votes > 0) == valid) & (votes <= 1)).all(),
+         "no share, or one where there is no class", "above 0 to 1 where valid, 0 elsewhere"),
+        ("grid/material", known[grid].all(),
+         "an unknown class", f"0 to {last}, {empty} or 255"),
+        ("grid/properties", _normalised(asset.grid_properties, grid < classes),
+         f"{unfit} grid/material", "-1 to 1 where annotated, NaN elsewhere"),
+    )  # fmt: skip
+    for where, fine, what, expected in values:
         if not fine:
-            what, expected = _FAULTS[where]
-            expected = expected.format(last=classes - 1, empty=empty)
             yield Finding(where, asset.asset_id, what, expected)
-
-
-_FAULTS = {
-    "voxel/coords": ("a coordinate occurs twice", "each once"),
-    "voxel/feats": ("NaN or infinite", "finite latents"),
-    "voxel/material": (
-        "a class that does not go with valid", "0 to {last} where valid, 255 elsewhere"
-    ),
-    "voxel/properties": (
-        "a property that does not go with valid", "-1 to 1 where valid, NaN elsewhere"
-    ),
-    "voxel/distance": ("negative or NaN", "a distance of 0 or more"),
-    "voxel/place": ("NaN or infinite", "finite points"),
-    "voxel/confidence": (
-        "no probability, or one where there is no class", "0 to 1 where valid, 0 elsewhere"
-    ),
-    "voxel/spread": (
-        "negative, or there where fewer than two annotations are",
-        "0 or more for all properties or NaN for all",
-    ),
-    "voxel/votes": (
-        "no share, or one where there is no class", "above 0 to 1 where valid, 0 elsewhere"
-    ),
-    "grid/material": ("an unknown class", "0 to {last}, {empty} or 255"),
-    "grid/properties": (
-        "a property that does not go with grid/material", "-1 to 1 where annotated, NaN elsewhere"
-    ),
-}  # fmt: skip
-"""What is wrong with an array that is not sound, and what is expected."""
 
 
 def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
