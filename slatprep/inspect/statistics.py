@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.inspect.overview import UNKNOWN, rows_chosen
-from slatprep.inspect.tallies import JOINT_BINS, SideTally, Tally, no_tally, pooled, tally
-from slatprep.records import Contents, Normalization, Place, Verdict
+from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
+from slatprep.records import Place, Verdict
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
@@ -215,8 +215,7 @@ def store_statistics(
     tasks = ((store.path, some, weight == "asset") for some in portions)
     tallied = zip(portions, run_in_order(_tally_some, tasks, jobs), strict=True)
     ranges, labels = store.normalization.ranges, store.contents.labels
-    make = _Summariser(store.normalization, store.contents)
-    total = nothing = no_tally(store.normalization, BINS, contents=store.contents)
+    total = nothing = no_tally(store, BINS)
     done, groups = 0, []
     for category, parts in groupby(tallied, lambda part: column[part[0][0]]):
         here, verdicts_here = nothing, Counter[str]()
@@ -227,9 +226,9 @@ def store_statistics(
             if progress:
                 progress(done, len(rows))
         total += here
-        groups.append(make.group("category", category or UNKNOWN, here, verdicts_here))
-    everything = make.group("all", "all", total, Counter(verdict_of[row] for row in rows))
-    classes = [make.group("class", name, total, None, k) for k, name in enumerate(labels)]
+        groups.append(_group(store, "category", category or UNKNOWN, here, verdicts_here))
+    everything = _group(store, "all", "all", total, Counter(verdict_of[row] for row in rows))
+    classes = [_group(store, "class", name, total, None, k) for k, name in enumerate(labels)]
     whole = everything.field.share, everything.slat.share
     return StoreStatistics(
         store=store.path,
@@ -240,107 +239,105 @@ def store_statistics(
         total=_of_whole(everything, *whole),
         classes=tuple(_of_whole(group, *whole) for group in classes),
         categories=tuple(_of_whole(group, *whole) for group in groups),
-        histograms=tuple(make.histogram(total, index) for index in range(len(ranges))),
-        joint=make.joint(total),
+        histograms=tuple(_histogram(store, total, index) for index in range(len(ranges))),
+        joint=_joint(store, total),
     )
 
 
 def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
     """Tally some assets of a store, in a worker."""
     store, names = open_store(path), ("material", "properties")
-    ranges, contents = store.normalization, store.contents
-    total = no_tally(ranges, BINS, contents=contents)
+    total = no_tally(store, BINS)
     for row in rows:
         # Not `store.asset`: it reads all columns of asset/*, which takes long in a large store.
         field = (store.read_rows(f"grid/{name}", row, row + 1)[0] for name in names)
         slat = store.read(row, names).values()
-        total += tally(field, slat, ranges, BINS, contents=contents, by_asset=by_asset)
+        total += tally(store, field, slat, BINS, by_asset)
     return total
 
 
-@dataclass(frozen=True, eq=False)
-class _Summariser:
-    """Turns tallies into statistics; `share` holds a weight until `_of_whole` divides it."""
+def _group(
+    store: Store,
+    by: Literal["all", "class", "category"],
+    name: str,
+    counts: Tally,
+    verdicts: Counter[str] | None = None,
+    index: int | None = None,
+) -> GroupStatistics:
+    """Summarise all classes of a tally, or one class by its index.
 
-    ranges: Normalization
-    contents: Contents
+    Shares are weights until `_of_whole` divides them.
+    """
+    named = {str(v): verdicts[str(v)] for v in Verdict} if verdicts is not None else {}
+    assets = sum(named.values()) if index is None else None
+    sides = (_side(store, counts, side, index, assets) for side in range(len(SIDES)))
+    return GroupStatistics(by, name, named, *sides)
 
-    def group(
-        self,
-        by: Literal["all", "class", "category"],
-        name: str,
-        counts: Tally,
-        verdicts: Counter[str] | None = None,
-        index: int | None = None,
-    ) -> GroupStatistics:
-        """Summarise all classes of a tally, or one class by its index."""
-        named = {str(v): verdicts[str(v)] for v in Verdict} if verdicts is not None else {}
-        assets = sum(named.values()) if index is None else None
-        sides = (self._side(side, index, assets) for side in (counts.field, counts.slat))
-        return GroupStatistics(by, name, named, *sides)
 
-    def _side(self, counts: SideTally, index: int | None, assets: int | None) -> SideStatistics:
-        """Summarise one side; the last entry of a tally is of voxels without an annotation."""
-        chosen = slice(None) if index is None else slice(index, index + 1)
-        annotated = slice(len(counts.weights) - 1) if index is None else chosen
-        own = counts.weights[annotated]
-        whole, part = float(counts.weights[chosen].sum()), float(own.sum())
-        names = self.contents.labels[annotated]
-        return SideStatistics(
-            assets=int(counts.assets[index or 0]) if assets is None else assets,
-            voxels=int(counts.voxels[chosen].sum()),
-            share=whole,
-            unannotated=_ratio(whole - part, whole),
-            classes={n: _ratio(float(w), part) for n, w in zip(names, own, strict=False)},
-            properties={
-                span.name: self._property(counts, number, annotated)
-                for number, span in enumerate(self.ranges.ranges)
-            },
-        )
+def _side(
+    store: Store, counts: Tally, side: int, index: int | None, assets: int | None
+) -> SideStatistics:
+    """Summarise one side; the last entry of a tally is of voxels without an annotation."""
+    chosen = slice(None) if index is None else slice(index, index + 1)
+    annotated = slice(counts.weights.shape[-1] - 1) if index is None else chosen
+    own = counts.weights[side, annotated]
+    whole, part = float(counts.weights[side, chosen].sum()), float(own.sum())
+    names = store.contents.labels[annotated]
+    return SideStatistics(
+        assets=int(counts.assets[side, index or 0]) if assets is None else assets,
+        voxels=int(counts.voxels[side, chosen].sum()),
+        share=whole,
+        unannotated=_ratio(whole - part, whole),
+        classes={n: _ratio(float(w), part) for n, w in zip(names, own, strict=False)},
+        properties={
+            span.name: _property(store, counts, (side, number, annotated))
+            for number, span in enumerate(store.normalization.ranges)
+        },
+    )
 
-    def _property(self, counts: SideTally, number: int, chosen: slice) -> PropertyStatistics:
-        span, weights = self.ranges.ranges[number], counts.weights[chosen]
-        unit = self.contents.properties[number].unit
-        own = counts.mean[:, number, chosen], counts.squares[:, number, chosen]
-        mean, squares = pooled(weights[None], *own, axis=1)
-        total = float(weights.sum())
-        if not total:
-            nothing = Distribution(*(np.nan,) * 4, dict.fromkeys(QUANTILE_NAMES, np.nan))
-            return PropertyStatistics(unit, nothing, nothing if span.log10 else None)
-        std = np.sqrt(squares / total)
-        least, most = counts.ends[0, number, chosen].min(), counts.ends[1, number, chosen].max()
-        inside = counts.histogram[number, chosen].sum(axis=0)
-        upto = np.cumsum(inside)
-        places = np.searchsorted(upto, np.multiply(QUANTILES, upto[-1]))
-        found = counts.sums[number, chosen].sum(axis=0)[places] / inside[places]
-        normalised = np.array([mean[0], least, most, *np.clip(found, least, most)])
-        half = 0.5 * (span.hi - span.lo)
-        mapped = (normalised + 1.0) * half + span.lo
-        if not span.log10:
-            return PropertyStatistics(unit, _distribution(mean[1], std[1], mapped), None)
-        log10 = _distribution(mapped[0], std[0] * half, mapped)
-        return PropertyStatistics(unit, _distribution(mean[1], std[1], 10.0**mapped), log10)
 
-    def histogram(self, counts: Tally, number: int) -> Histogram:
-        """Return a property's histogram by class, in `DRAWN_BINS` bins."""
-        span = self.ranges.ranges[number]
-        sides = (
-            side.histogram[number].reshape(-1, DRAWN_BINS, BINS // DRAWN_BINS).sum(axis=-1)
-            for side in (counts.field, counts.slat)
-        )
-        edges = np.linspace(span.lo, span.hi, DRAWN_BINS + 1)
-        unit = self.contents.properties[number].unit
-        return Histogram(span.name, unit, span.log10, edges, *sides)
+def _property(store: Store, counts: Tally, of: tuple[int, int, slice]) -> PropertyStatistics:
+    """Summarise a property on a side, over some classes."""
+    side, number, chosen = of
+    span, weights = store.normalization.ranges[number], counts.weights[side, chosen]
+    unit = store.contents.properties[number].unit
+    own = counts.mean[side, :, number, chosen], counts.squares[side, :, number, chosen]
+    mean, squares = pooled(weights[None], *own, axis=1)
+    total = float(weights.sum())
+    if not total:
+        nothing = Distribution(*(np.nan,) * 4, dict.fromkeys(QUANTILE_NAMES, np.nan))
+        return PropertyStatistics(unit, nothing, nothing if span.log10 else None)
+    std = np.sqrt(squares / total)
+    least, most = counts.least[of].min(), counts.most[of].max()
+    inside = counts.histogram[of].sum(axis=0)
+    upto = np.cumsum(inside)
+    places = np.searchsorted(upto, np.multiply(QUANTILES, upto[-1]))
+    found = counts.sums[of].sum(axis=0)[places] / inside[places]
+    normalised = np.array([mean[0], least, most, *np.clip(found, least, most)])
+    half = 0.5 * (span.hi - span.lo)
+    mapped = (normalised + 1.0) * half + span.lo
+    if not span.log10:
+        return PropertyStatistics(unit, _distribution(mean[1], std[1], mapped), None)
+    log10 = _distribution(mapped[0], std[0] * half, mapped)
+    return PropertyStatistics(unit, _distribution(mean[1], std[1], 10.0**mapped), log10)
 
-    def joint(self, counts: Tally) -> JointHistogram | None:
-        """Return the joint histogram of the first two properties."""
-        if len(self.ranges.ranges) < 2:
-            return None
-        first, second = self.ranges.ranges[:2]
-        edges = [np.linspace(span.lo, span.hi, JOINT_BINS + 1) for span in (first, second)]
-        return JointHistogram(
-            (first.name, second.name), (edges[0], edges[1]), counts.field.joint, counts.slat.joint
-        )
+
+def _histogram(store: Store, counts: Tally, number: int) -> Histogram:
+    """Return a property's histogram by class, in `DRAWN_BINS` bins."""
+    span, whole = store.normalization.ranges[number], counts.histogram[:, number]
+    sides = whole.reshape(*whole.shape[:-1], DRAWN_BINS, -1).sum(axis=-1)
+    edges = np.linspace(span.lo, span.hi, DRAWN_BINS + 1)
+    unit = store.contents.properties[number].unit
+    return Histogram(span.name, unit, span.log10, edges, *sides)
+
+
+def _joint(store: Store, counts: Tally) -> JointHistogram | None:
+    """Return the joint histogram of the first two properties."""
+    if len(store.normalization.ranges) < 2:
+        return None
+    first, second = store.normalization.ranges[:2]
+    edges = [np.linspace(span.lo, span.hi, JOINT_BINS + 1) for span in (first, second)]
+    return JointHistogram((first.name, second.name), (edges[0], edges[1]), *counts.joint)
 
 
 def _distribution(mean: np.floating, std: np.floating, values: NDArray[np.float64]) -> Distribution:
@@ -370,7 +367,7 @@ COLUMNS = ("by", "name", "side", "assets", "voxels", "share", "unannotated", "pr
 
 def table_of(statistics: StoreStatistics) -> Iterator[tuple[str | int | float, ...]]:
     """Yield a row of `COLUMNS` for each group, side, property and scale."""
-    for group, side in product(statistics.groups, ("field", "slat")):
+    for group, side in product(statistics.groups, SIDES):
         own: SideStatistics = getattr(group, side)
         which = (group.by, group.name, side, own.assets, own.voxels, own.share, own.unannotated)
         for name, found in own.properties.items():

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.normalize import denormalize_properties
-from slatprep.records import Contents, Normalization
+from slatprep.store import Store
 
 JOINT_BINS = 64
 """Bins of either axis of the joint histogram, over [-1, 1]."""
@@ -24,27 +24,33 @@ Voxels = Iterable[NDArray[Any]]
 """Classes and normalised properties of voxels."""
 
 
+SIDES = ("field", "slat")
+"""The PixieVerse field, before the lookup, and the SLAT's voxels, after it."""
+
+
 @dataclass(frozen=True, eq=False)
-class SideTally:
-    """Sums over the voxels of one side of an asset, or of many; C is `Contents.n_labels`.
+class Tally:
+    """Sums over the voxels of an asset, or of many; the first axis of all has the `SIDES`.
+
+    C is the number of labels, P that of properties.
 
     Attributes
     ----------
-    assets, voxels : ndarray of int64, shape (C + 1,)
+    assets, voxels : ndarray of int64, shape (2, C + 1)
         By class, the number of voxels and of assets that have any; the last entry is for
         voxels without an annotation.
-    weights : ndarray of float64, shape (C + 1,)
+    weights : ndarray of float64, shape (2, C + 1)
         Total weight of those voxels.
-    histogram : ndarray of float64, shape (P, C, bins)
+    histogram : ndarray of float64, shape (2, P, C, bins)
         Weight by property, class and bin of the normalised value, over [-1, 1].
-    sums : ndarray of float64, shape (P, C, bins)
+    sums : ndarray of float64, shape (2, P, C, bins)
         Weighted sum of the normalised values in each bin, whose mean is exact where all are equal.
-    joint : ndarray of float64, shape (JOINT_BINS, JOINT_BINS)
+    joint : ndarray of float64, shape (2, JOINT_BINS, JOINT_BINS)
         Weight by bins of the first two properties; zero if there is only one.
-    mean, squares : ndarray of float64, shape (2, P, C)
+    mean, squares : ndarray of float64, shape (2, 2, P, C)
         Weighted mean, and weighted sum of squared differences from it, of the
         normalised values and of those in SI units.
-    ends : ndarray of float64, shape (2, P, C)
+    least, most : ndarray of float64, shape (2, P, C)
         Smallest and largest normalised value; inf and -inf where there are no voxels.
     """
 
@@ -56,31 +62,21 @@ class SideTally:
     joint: NDArray[np.float64]
     mean: NDArray[np.float64]
     squares: NDArray[np.float64]
-    ends: NDArray[np.float64]
+    least: NDArray[np.float64]
+    most: NDArray[np.float64]
 
-    def __add__(self, other: SideTally) -> SideTally:
+    def __add__(self, other: Tally) -> Tally:
         weights = np.stack([self.weights, other.weights])
         mean, squares = pooled(
-            weights[:, None, None, :-1],
+            weights[:, :, None, None, :-1],
             np.stack([self.mean, other.mean]),
             np.stack([self.squares, other.squares]),
             axis=0,
         )
-        least, most = np.minimum(self.ends, other.ends)[0], np.maximum(self.ends, other.ends)[1]
+        least, most = np.minimum(self.least, other.least), np.maximum(self.most, other.most)
         names = ("assets", "voxels", "weights", "histogram", "sums", "joint")
         sums = {name: getattr(self, name) + getattr(other, name) for name in names}
-        return SideTally(**sums, mean=mean, squares=squares, ends=np.stack([least, most]))
-
-
-@dataclass(frozen=True, eq=False)
-class Tally:
-    """The PixieVerse field, before the lookup, and the SLAT's voxels, after it."""
-
-    field: SideTally
-    slat: SideTally
-
-    def __add__(self, other: Tally) -> Tally:
-        return Tally(self.field + other.field, self.slat + other.slat)
+        return Tally(**sums, mean=mean, squares=squares, least=least, most=most)
 
 
 def pooled(
@@ -96,51 +92,42 @@ def pooled(
     return centre.squeeze(axis), merged
 
 
-def no_tally(ranges: Normalization, bins: int, *, contents: Contents) -> Tally:
-    """Return the tally of no voxels, for a number of bins."""
-    material, properties = np.zeros(0, np.uint8), np.zeros((len(ranges.ranges), 0), np.float32)
-    return tally((material, properties), (material, properties.T), ranges, bins, contents=contents)
+def no_tally(store: Store, bins: int) -> Tally:
+    """Return the tally of no voxels of a store, for a number of bins."""
+    properties = np.zeros((len(store.normalization.ranges), 0), np.float32)
+    material = np.zeros(0, np.uint8)
+    return tally(store, (material, properties), (material, properties.T), bins)
 
 
-def tally(
-    field: Voxels,
-    slat: Voxels,
-    ranges: Normalization,
-    bins: int,
-    *,
-    contents: Contents,
-    by_asset: bool = False,
-) -> Tally:
-    """Tally the voxels of one asset by `bins` of the normalised values over [-1, 1].
+def tally(store: Store, field: Voxels, slat: Voxels, bins: int, by_asset: bool = False) -> Tally:
+    """Tally the voxels of one asset of a store by `bins` of the normalised values over [-1, 1].
 
     `field` and `slat` are classes and normalised properties in the shapes of ``grid/*`` ((R, R, R)
     and (P, R, R, R)) and of ``voxel/*`` ((N,) and (N, P)). With `by_asset`, all voxels of a side
     have weight 1 together, otherwise 1 each.
     """
     (grid, values), (material, properties) = field, slat
-    labels = contents.n_labels
-    before = grid[grid != contents.background], values[:, grid < labels]
+    labels = store.contents.n_labels
+    before = grid[grid != store.contents.background], values[:, grid < labels]
     after = material, properties[material < labels].T
-    return Tally(
-        _side(*before, ranges, bins, labels, by_asset),
-        _side(*after, ranges, bins, labels, by_asset),
-    )
+    sides = [_side(store, of, own, bins, by_asset) for of, own in (before, after)]
+    return Tally(**{name: np.stack([one[name] for one in sides]) for name in sides[0]})
 
 
 def _side(
+    store: Store,
     material: NDArray[np.uint8],
     properties: NDArray[np.float32],
-    ranges: Normalization,
     bins: int,
-    labels: int,
     by_asset: bool,
-) -> SideTally:
-    """Tally voxels (N,), and normalised properties (P, K) of those with a class."""
+) -> dict[str, NDArray[Any]]:
+    """Tally voxels (N,) of one side, and normalised properties (P, K) of those with a class."""
+    labels = store.contents.n_labels
     weight = np.float64(1.0 / max(len(material), 1) if by_asset else 1.0)
     classes = np.minimum(material, labels)
     counts = np.bincount(classes, minlength=labels + 1).astype(np.int64)
     own = classes[classes < labels].astype(np.int64)
-    values = np.stack([properties, denormalize_properties(properties.T, ranges).T])
+    values = np.stack([properties, denormalize_properties(properties.T, store.normalization).T])
     values = values.astype(np.float64)
     size, shape = labels * bins, (len(properties), labels, bins)
     places = own * bins + _bins(properties, bins)
@@ -150,25 +137,25 @@ def _side(
     if len(properties) > 1:
         first, second = _bins(properties[:2], JOINT_BINS)
         joint += np.bincount(first * JOINT_BINS + second, minlength=JOINT_BINS**2) * weight
-    mean = np.zeros((2, len(properties), labels))
-    squares = np.zeros_like(mean)
-    ends = np.stack([np.full(mean.shape[1:], end) for end in (np.inf, -np.inf)])
+    mean, squares = np.zeros((2, 2, len(properties), labels))
+    least, most = (np.full(mean.shape[1:], end) for end in (np.inf, -np.inf))
     for index in np.flatnonzero(counts[:-1]):
         chosen = values[:, :, own == index]
         mean[..., index] = chosen.mean(axis=-1)
         squares[..., index] = ((chosen - mean[..., index, None]) ** 2).sum(axis=-1) * weight
-        ends[:, :, index] = chosen[0].min(axis=-1), chosen[0].max(axis=-1)
-    return SideTally(
-        assets=(counts > 0).astype(np.int64),
-        voxels=counts,
-        weights=counts * weight,
-        histogram=np.stack(histogram).reshape(shape) * weight,
-        sums=np.stack(sums).reshape(shape) * weight,
-        joint=joint.reshape(JOINT_BINS, JOINT_BINS),
-        mean=mean,
-        squares=squares,
-        ends=ends,
-    )
+        least[:, index], most[:, index] = chosen[0].min(axis=-1), chosen[0].max(axis=-1)
+    return {
+        "assets": (counts > 0).astype(np.int64),
+        "voxels": counts,
+        "weights": counts * weight,
+        "histogram": np.stack(histogram).reshape(shape) * weight,
+        "sums": np.stack(sums).reshape(shape) * weight,
+        "joint": joint.reshape(JOINT_BINS, JOINT_BINS),
+        "mean": mean,
+        "squares": squares,
+        "least": least,
+        "most": most,
+    }
 
 
 def _bins(values: NDArray[np.float32], bins: int) -> NDArray[np.int64]:

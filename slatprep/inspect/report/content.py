@@ -204,7 +204,7 @@ def _errors(store: Store) -> dict[str, Any]:
 def _properties(store: Store, tallies: Mapping[str, Tally], clipped: bool) -> list[dict[str, Any]]:
     """Return the histograms of each property by class, and its ranges."""
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
-    total = sum(tallies.values(), start=no_tally(normalization, BINS, contents=store.contents))
+    total = sum(tallies.values(), start=no_tally(store, BINS)).histogram.astype(np.int64)
     return [
         {
             **vars(span),
@@ -219,8 +219,7 @@ def _properties(store: Store, tallies: Mapping[str, Tally], clipped: bool) -> li
         for span, one, field, slat, count in zip(
             normalization.ranges,
             store.contents.properties,
-            total.field.histogram.astype(np.int64),
-            total.slat.histogram.astype(np.int64),
+            *total,
             store.column("clipped").sum(axis=0),
             strict=True,
         )
@@ -234,7 +233,7 @@ def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]
         {
             "category": category,
             "assets": assets[category],
-            "classes": tallies[category].slat.voxels.tolist(),
+            "classes": tallies[category].voxels[1].tolist(),
         }
         for category in sorted(tallies)
     ]

@@ -97,7 +97,7 @@ def draw_asset(source: SourceStore, row: int) -> tuple[Drawn, Tally]:
     voxels = {side: encode_asset(asset, way, side) for side in (FULL, COARSE)}
     field = asset.grid_material, asset.grid_properties
     slat = asset.material, asset.properties
-    counts = tally(field, slat, store.normalization, BINS, contents=store.contents)
+    counts = tally(store, field, slat, BINS)
     return Drawn(row, thumbnail(asset), voxels, *_agreement(asset)), counts
 
 
