@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,13 +67,6 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Made:
     dataset = Dataset(folder / "sources").having(*"abcdef")
     build_store(dataset.parameters("pixie"), folder / "s.zarr", jobs=1)
     return dataset, folder / "s.zarr"
-
-
-@pytest.fixture(scope="module")
-def threads() -> Iterator[str]:
-    """Two workers within this process."""
-    with threads_for_workers(2) as started:
-        yield started.scheduler_address
 
 
 # -- a build ----------------------------------------------------------------
@@ -251,14 +243,3 @@ def test_jobs_and_scheduler_exclude_each_other():
     options = ("--jobs", 2, "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr")
     result = run("build-store", *options, code=2)
     assert "--jobs is for this machine" in result.output
-
-
-# -- tasks ------------------------------------------------------------------
-
-
-def test_workers_compute_and_not_this_thread(threads):
-    with Cluster(threads) as cluster:
-        idents = set(cluster.run_unordered(threading.get_ident, [()] * 5))
-        assert threading.get_ident() not in idents
-        variables = [(name,) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")]
-        assert list(cluster.run_unordered(os.getenv, variables)) == ["1", "1"]

@@ -59,27 +59,7 @@ def left_behind(s3: Any, url: str) -> set[str]:
     }
 
 
-def test_killed_workers_with_disks_of_their_own_write_the_bytes_of_one_machine(
-    s3, url, sources, undisturbed, shared, address, tmp_path
-):
-    kills = [shared[0].folder / f"kill at {step}"
-             for step in ("asset spooled", "shard filled", "shard written")]  # fmt: skip
-    for kill in kills:
-        kill.touch()
-    with Cluster(address) as cluster:
-        parameters = Dataset(place_of(sources)).parameters("pixie")
-        summary = build_store(parameters, url, jobs=cluster)
-    assert summary.complete
-    assert not any(kill.exists() for kill in kills)
-    assert current(s3, url) == tree(undisturbed[1])
-    assert left_behind(s3, url) == set()
-    assert verify_store(url).ok
-    # No array was on the disk of the machine that ran the command; what it saw stays there.
-    stay = [path.name for path in (tmp_path / "cache").rglob("*") if path.is_file()]
-    assert stay == ["sources.seen"]
-
-
-def test_a_command_that_is_killed_again_and_again_goes_on_where_it_was(
+def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_one_machine(
     s3, url, sources, undisturbed, another, shared, address, tmp_path
 ):
     faults = shared[0].folder
@@ -112,10 +92,18 @@ def test_a_command_that_is_killed_again_and_again_goes_on_where_it_was(
         assert killed.wait(900) == -9, step
         assert current(s3, url) == tree(another[1])
     assert len(spooled(s3, url)) == 3
+    kills = [faults / f"kill at {step}" for step in ("shard filled", "shard written")]
+    for kill in kills:
+        kill.touch()
     assert build().wait(900) == 0
+    assert not any(kill.exists() for kill in kills)
     assert current(s3, url) == tree(undisturbed[1])
     assert left_behind(s3, url) == set()
     assert len(versions(s3, url)) == 2
+    assert verify_store(url).ok
+    # No array was on the disk of the machine that ran the command; what it saw stays there.
+    stay = [path.name for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+    assert stay == ["sources.seen"]
     aligned = (faults / "aligned").read_text().split()
     assert sorted(aligned) == ["a", "b", "c"]
 
@@ -201,10 +189,13 @@ def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
 
 
-def test_a_dry_run_on_a_cluster_finds_what_its_build_would(s3, url, undisturbed, sources, address):
+def test_a_dry_run_on_a_cluster_finds_what_its_build_would(s3, url, sources, shared, address):
+    kill = shared[0].folder / "kill at asset spooled"
+    kill.touch()
     parameters = Dataset(place_of(sources)).parameters("pixie")
     with Cluster(address) as cluster:
-        build_store(parameters, url, jobs=cluster, keep_work=True)
+        assert build_store(parameters, url, jobs=cluster, keep_work=True).complete
+        assert not kill.exists()
         s3.rm(f"{url}/current.json")
         plan = plan_build(parameters, url, jobs=cluster)
         fresh = plan_build(parameters, url, jobs=cluster, fresh=True)

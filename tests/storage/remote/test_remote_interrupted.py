@@ -1,21 +1,16 @@
 """Builds on S3 that are killed, overtaken, spoiled or updated."""
 
-import json
 import multiprocessing
 import os
-import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
+import faulty_s3
 import pytest
 from s3fs.core import S3FileSystem
-from support import remote
 from support.faults import inject, kill_self
-from support.remote import Dataset, Made, current, put, raising, versions
+from support.remote import Dataset, built, current, put, raising, versions
 from support.trees import contents, tree
 
 from slatprep.errors import StoreError
@@ -47,6 +42,14 @@ def kill_after() -> Fault:
     return lambda step, name: step == "pointer replaced" and kill_self()
 
 
+def end_of(run: Callable[[], None]) -> int | None:
+    """Call a function in a forked process; return its exit code."""
+    child = multiprocessing.get_context("fork").Process(target=run)
+    child.start()
+    child.join(600)
+    return child.exitcode
+
+
 def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) -> None:
     """Build in a process of its own that kills itself with signal 9 where `fault` has it."""
 
@@ -54,10 +57,7 @@ def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) 
         inject(pytest.MonkeyPatch(), fault())
         build_store(dataset.parameters("pixie"), url)
 
-    child = multiprocessing.get_context("fork").Process(target=run)
-    child.start()
-    child.join(600)
-    assert child.exitcode == -signal.SIGKILL
+    assert end_of(run) == -signal.SIGKILL
 
 
 @pytest.mark.parametrize(
@@ -181,42 +181,40 @@ def test_a_lost_answer_makes_no_failure_of_a_success_and_no_word_false(
 
 def test_spoiled_answers_end_in_the_same_store_or_in_words():
     """The short version of ``benchmarks/faulty_s3.py``."""
-    script = str(Path(__file__).parents[3] / "benchmarks" / "faulty_s3.py")
-    command = [sys.executable, script, "--runs", "4", "--seed", "1"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert (told["runs"], told["harm"]) == (4, 0)
-    assert told["faults"] > 0
 
+    def run() -> None:
+        S3FileSystem.clear_instance_cache()
+        with faulty_s3.bench_of(seed=1) as bench:
+            for number in range(4):
+                bench.run(number)
+        assert bench.harm == []
+        assert bench.faults.told.total() > 0
 
-@pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Four assets and their store; nobody may change them."""
-    return remote.built(tmp_path_factory.mktemp("first"), "a", "c", "e", "g")
-
-
-@pytest.fixture
-def built(first: Made, url: str, tmp_path: Path, files_are_old: None, few_are_new: None) -> Made:
-    """Four assets; a store of them on S3 that another machine put there, and the same here."""
-    sources = shutil.copytree(first[0].root, tmp_path / "sources")
-    beside = shutil.copytree(first[1], tmp_path / "s.zarr")
-    put(beside, url)
-    return Dataset(sources), beside
+    assert end_of(run) == 0
 
 
 def below(names: list[str], version: str) -> set[str]:
     return {name.partition(f"{version}/")[2] for name in names} - {""}
 
 
-def test_shards_that_did_not_change_are_copied_by_the_server(s3, url, built, requests, monkeypatch):
-    dataset, beside = built
+@pytest.mark.usefixtures("files_are_old", "few_are_new")
+def test_shards_that_did_not_change_are_copied_by_the_server_and_what_is_gone_is_made_again(
+    s3, url, tmp_path, requests, monkeypatch
+):
+    dataset, beside = built(tmp_path, "a", "c", "e", "g")
+    put(beside, url)  # As from another machine: nothing here knows of the sources' states.
     before = tree(beside)
     dataset.add("b", seed=1)
     begun: list[str] = []
     inject(monkeypatch, lambda step, name: begun.append(name) if step == "asset begun" else None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(S3FileSystem, "_cp_file", raising(PermissionError("Access Denied")))
+        with pytest.raises(StoreError, match=r"cannot be written .*nothing was replaced"):
+            build_store(dataset.parameters("pixie"), url)
+    assert current(s3, url) == before
     old = open_store(url).path.name
-    requests.made.clear()
+    for noted in (requests.made, begun):
+        noted.clear()
     build_store(dataset.parameters("pixie"), url)
     assert begun == ["b"]
     new = open_store(url).path.name
@@ -239,16 +237,8 @@ def test_shards_that_did_not_change_are_copied_by_the_server(s3, url, built, req
     assert not copied & below(requests.of("put_object"), new)
     assert verify_store(url, sources=True).ok
 
-
-def test_an_update_that_cannot_copy_changes_nothing_and_what_is_gone_is_made_again(s3, url, built):
-    dataset, beside = built
-    dataset.add("b", seed=1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(S3FileSystem, "_cp_file", raising(PermissionError("Access Denied")))
-        with pytest.raises(StoreError, match=r"cannot be written .*nothing was replaced"):
-            build_store(dataset.parameters("pixie"), url)
-    assert current(s3, url) == tree(beside)
     s3.rm(f"{open_store(url).path}/voxel/feats/c/0/0")
+    dataset.add("d", seed=2)
     summary = build_store(dataset.parameters("pixie"), url)
     assert any("voxel/feats/c/0/0" in told for told in summary.damaged)
     build_store(dataset.parameters("pixie"), beside)
