@@ -37,17 +37,25 @@ def prediction_of(grid: np.ndarray, *, scores: bool) -> np.ndarray:
     return prediction
 
 
-def mask_of(grid: np.ndarray) -> np.ndarray:
-    return (grid[..., 3] != 7).astype(np.float32)
+RAW = raw_grid()
+MASK = (RAW[..., 3] != 7).astype(np.float32)
+SCORES, IDS = (prediction_of(RAW, scores=scores) for scores in (True, False))
+
+
+def changed(array: np.ndarray, *edits: tuple[object, object]) -> np.ndarray:
+    """Return a copy with other values at places."""
+    made = array.copy()
+    for place, value in edits:
+        made[place] = value
+    return made
 
 
 @pytest.mark.parametrize("grid_dtype", ["f4", ">f4", "f8"])
 @pytest.mark.parametrize("mask_dtype", [None, "bool", "u1", "i8", "f2", "f4", ">f8"])
 def test_raw_grid(make_pair, grid_dtype, mask_dtype):
-    grid = raw_grid()
-    mask = None if mask_dtype is None else mask_of(grid).astype(mask_dtype)
+    mask = None if mask_dtype is None else MASK.astype(mask_dtype)
     order = "F" if mask_dtype == "bool" else "C"
-    field = read_field(make_pair(grid=grid.astype(grid_dtype, order=order), mask=mask))
+    field = read_field(make_pair(grid=RAW.astype(grid_dtype, order=order), mask=mask))
 
     assert field.voxels.tolist() == VOXELS
     assert field.voxels.dtype == np.uint8
@@ -63,13 +71,10 @@ def test_raw_grid(make_pair, grid_dtype, mask_dtype):
 @pytest.mark.parametrize("scores", [True, False])
 @pytest.mark.parametrize("masked", [False, True])
 def test_prediction_comes_back_to_si(make_pair, scores, masked):
-    grid = raw_grid()
-    grid[60, 0, 63] = 500.0, 1.0e5, 0.44, 6  # the published range ends at 0.449
-    grid[1, 2, 4] = 7400.0, 7.0e10, 0.30, 1
-    pair = make_pair(
-        grid=prediction_of(grid, scores=scores), mask=mask_of(grid) if masked else None
-    )
-    field = read_field(pair)
+    # The published range of the ratio ends at 0.449.
+    within = ((60, 0, 63), (500.0, 1.0e5, 0.44, 6)), ((1, 2, 4), (7400.0, 7.0e10, 0.30, 1))
+    grid = prediction_of(changed(RAW, *within), scores=scores)
+    field = read_field(make_pair(grid=grid, mask=MASK if masked else None))
 
     assert field.voxels.tolist() == VOXELS
     assert field.material.tolist() == MATERIAL
@@ -79,11 +84,9 @@ def test_prediction_comes_back_to_si(make_pair, scores, masked):
 
 
 def test_prediction_beyond_its_range_is_clipped_and_counted(make_pair):
-    prediction = prediction_of(raw_grid(), scores=True)
-    prediction[0, 1, 2, 3] = 1.5  # density
-    prediction[1, 1, 2, 3] = -3.0  # Young's modulus
-    prediction[2, :, 2, 3] = 7.0  # Poisson's ratio; one of these voxels is occupied
-    field = read_field(make_pair(grid=prediction))
+    # Density, Young's modulus and Poisson's ratio, of which one of the voxels is occupied.
+    beyond = ((0, 1, 2, 3), 1.5), ((1, 1, 2, 3), -3.0), (np.s_[2, :, 2, 3], 7.0)
+    field = read_field(make_pair(grid=changed(SCORES, *beyond)))
 
     np.testing.assert_allclose(
         field.properties[0], [10 ** LOG_E[0], 10 ** LOG_DENSITY[1], NU[1]], rtol=2e-6
@@ -94,53 +97,38 @@ def test_prediction_beyond_its_range_is_clipped_and_counted(make_pair):
     assert "youngs_modulus" in clipped[0]
 
 
-def test_class_scores_need_not_be_one_hot(make_pair):
-    grid = raw_grid()
-    prediction = prediction_of(grid, scores=True)
-    rng = np.random.default_rng(0)
-    prediction[3:] = 4 * prediction[3:] - rng.random((8, 64, 64, 64), dtype=np.float32)
-    assert read_field(make_pair(grid=prediction)).material.tolist() == MATERIAL
+def _noisy_scores() -> np.ndarray:
+    noise = np.random.default_rng(0).random((8, 64, 64, 64), dtype=np.float32)
+    return changed(SCORES, (np.s_[3:], 4 * SCORES[3:] - noise))
 
 
-def test_tied_class_scores_label_nothing(make_pair):
-    prediction = prediction_of(raw_grid(), scores=True)
-    prediction[3:, 1, 2, 3] = 0  # no class at all: not jelly
-    prediction[3:10, 1, 2, 3] = 1
-    field = read_field(make_pair(grid=prediction, mask=mask_of(raw_grid())))
-    assert field.material.tolist() == [1, 6]
-    assert field.occupancy[1, 2, 3]
-    assert any("no single highest class score" in warning for warning in field.warnings)
+# No class at all is not jelly.
+TIED = changed(SCORES, (np.s_[3:, 1, 2, 3], 0), (np.s_[3:10, 1, 2, 3], 1))
+ISLAND = changed(RAW, (np.s_[10, 10, 10:12], (0, 0, 0, -1)))
+OTHER_MASK = changed(MASK, ((1, 2, 3), 0), (np.s_[20, 20, 20:24], 1))
+SOFT_MASK = changed(MASK, ((1, 2, 3), 0.5), ((1, 2, 4), 0.75))
+ODD = {
+    "scores not one-hot": (_noisy_scores(), None, 3, []),
+    "tied scores": (TIED, MASK, 3, ["1 voxels have no single highest class score; not annotated",
+                                    "1 occupied voxels have no class (-1); not annotated"]),
+    "an island": (ISLAND, None, 5, ["2 occupied voxels have no class (-1); not annotated"]),
+    "another mask": (RAW, OTHER_MASK, 6, ["4 voxels of the mask are background; not annotated",
+                                          "1 voxels with a class lie outside the mask; left out"]),
+    "a soft mask": (RAW, SOFT_MASK, 2, ["mask: 2 voxels lie between 0 and 1; above 0.5 is occupied",
+                                        "1 voxels with a class lie outside the mask; left out"]),
+}  # fmt: skip
 
 
-def test_unlabelled_island_is_occupied_but_not_annotated(make_pair):
-    grid = raw_grid()
-    grid[10, 10, 10:12] = 0, 0, 0, -1
-    field = read_field(make_pair(grid=grid))
-    assert field.voxels.tolist() == VOXELS
-    assert field.occupancy.sum() == 5
-    assert field.warnings == ("2 occupied voxels have no class (-1); not annotated",)
-
-
-def test_disagreeing_mask_is_believed_and_reported(make_pair):
-    grid = raw_grid()
-    mask = mask_of(grid) > 0
-    mask[1, 2, 3] = False
-    mask[20, 20, 20:24] = True
+@pytest.mark.parametrize("case", ODD)
+def test_an_odd_grid_or_mask_is_read_as_far_as_it_goes_and_reported(make_pair, case):
+    grid, mask, occupied, warnings = ODD[case]
     field = read_field(make_pair(grid=grid, mask=mask))
-    assert field.voxels.tolist() == VOXELS[1:]
-    np.testing.assert_array_equal(field.occupancy, mask)
-    assert field.warnings == (
-        "4 voxels of the mask are background; not annotated",
-        "1 voxels with a class lie outside the mask; left out",
-    )
-
-
-def test_soft_mask_is_cut_at_one_half(make_pair):
-    mask = mask_of(raw_grid())
-    mask[1, 2, 3], mask[1, 2, 4] = 0.5, 0.75
-    field = read_field(make_pair(mask=mask))
-    assert field.voxels.tolist() == VOXELS[1:]
-    assert field.warnings[0].startswith("mask: 2 voxels lie between 0 and 1")
+    lost = 1 if mask is not None else 0
+    assert (field.voxels.tolist(), field.material.tolist()) == (VOXELS[lost:], MATERIAL[lost:])
+    assert field.occupancy.sum() == occupied
+    if mask is not None:
+        np.testing.assert_array_equal(field.occupancy, mask > 0.5)
+    assert [warning for warning in field.warnings if "clipped" not in warning] == warnings
 
 
 def test_sources_are_named_and_hashed_and_bounds_are_ready_for_json(make_pair):
@@ -151,7 +139,7 @@ def test_sources_are_named_and_hashed_and_bounds_are_ready_for_json(make_pair):
         "alpha_weighted": True,
         "model": "ViT-L",
     }
-    pair = make_pair(mask=mask_of(raw_grid()), bounds=bounds)
+    pair = make_pair(mask=MASK, bounds=bounds)
     field = read_field(pair)
     assert json.loads(json.dumps(field.bounds)) == bounds
     sources = {source.role: source for source in field.sources}
@@ -175,39 +163,32 @@ def test_unreadable_bounds_are_a_warning(make_pair):
     assert "bounds not read" in field.warnings[0]
 
 
-def _with(voxel, channel, value, grid=raw_grid):
-    changed = grid()
-    changed[(*voxel, channel)] = value
-    return changed
-
-
+CLASS = (9, 8, 7, 3)
 BAD_GRIDS = {
-    "five channels": (np.zeros((5, 64, 64, 64), np.float32), "shape (5,", "(11, 64, 64, 64)"),
+    "five channels": (np.zeros((5, 64, 64, 64)), "shape (5,", "(11, 64, 64, 64)"),
     "complex": (np.zeros((64, 64, 64, 4), np.complex64), "dtype <c8", "floating-point"),
-    "class -2": (_with((9, 8, 7), 3, -2), "unknown class -2 at voxel (9, 8, 7)", "-1 to 7"),
-    "class 1.5": (_with((9, 8, 7), 3, 1.5), "unknown class 1.5 at voxel (9, 8, 7)", "whole"),
-    "class nan": (_with((9, 8, 7), 3, np.nan), "unknown class nan at voxel (9, 8, 7)", "whole"),
+    "class -2": (changed(RAW, (CLASS, -2)), "unknown class -2 at voxel (9, 8, 7)", "-1 to 7"),
+    "class 1.5": (changed(RAW, (CLASS, 1.5)), "unknown class 1.5 at voxel (9, 8, 7)", "whole"),
+    "class nan": (changed(RAW, (CLASS, np.nan)), "unknown class nan at voxel (9, 8, 7)", "whole"),
     "nothing annotated": (
-        np.full((64, 64, 64, 4), -1, np.float32),
+        np.full((64, 64, 64, 4), -1.0),
         "none of the 262144 occupied voxels is annotated",
         "class 0 to 6",
     ),
     "score nan": (
-        _with((4, 1, 2), 3, np.nan, lambda: prediction_of(raw_grid(), scores=True)),
+        changed(SCORES, ((4, 1, 2, 3), np.nan)),
         "class score is NaN or infinite at voxel (1, 2, 3)",
         "finite",
     ),
     "predicted nan": (
-        _with((2, 1, 2), 3, np.nan, lambda: prediction_of(raw_grid(), scores=True)),
+        changed(SCORES, ((2, 1, 2, 3), np.nan)),
         "ratio nan at annotated voxel (1, 2, 3)",
         "ratio in [0, 0.5], in all but 10% (sample.max_unphysical)",
     ),
     "predicted class": (
-        _with((3, 1, 2), 3, 9, lambda: prediction_of(raw_grid(), scores=False)),
-        "unknown class 9 at voxel (1, 2, 3)",
-        "-1 to 7",
+        changed(IDS, ((3, 1, 2, 3), 9)), "unknown class 9 at voxel (1, 2, 3)", "-1 to 7"
     ),
-}
+}  # fmt: skip
 
 
 UNPHYSICAL = {
@@ -225,7 +206,7 @@ UNPHYSICAL = {
 @pytest.mark.parametrize("case", UNPHYSICAL)
 def test_an_unphysical_voxel_is_not_annotated_and_one_of_few_is_refused(make_pair, case):
     channel, value, named, expected = UNPHYSICAL[case]
-    few, grid = raw_grid().astype(np.float64), raw_grid().astype(np.float64)
+    few, grid = RAW.astype(np.float64), RAW.astype(np.float64)
     grid[20:23, 20:23, 20] = 900.0, 1.0e6, 0.0, 2  # none of these is at fault
     grid[20, 21, 20, channel] = few[1, 2, 4, channel] = value
     read = read_field(make_pair(grid=grid))
@@ -245,12 +226,10 @@ def test_an_unphysical_voxel_is_not_annotated_and_one_of_few_is_refused(make_pai
 
 
 def test_an_asset_fails_by_the_share_of_its_unphysical_voxels(make_pair):
-    prediction = prediction_of(raw_grid(), scores=True)
-    prediction[1, 1, 2, 3] = np.inf  # not a very large value that may be clipped
-    read = read_field(make_pair(grid=prediction), 1 / 3)
+    # Not a very large value that may be clipped.
+    read = read_field(make_pair(grid=changed(SCORES, ((1, 1, 2, 3), np.inf))), 1 / 3)
     assert (len(read.voxels), read.unphysical) == (2, 1)
-    grid = raw_grid()
-    grid[1, 2, 3, 2] = 0.7
+    grid = changed(RAW, ((1, 2, 3, 2), 0.7))
     assert len(read_field(make_pair(grid=grid), 1 / 3).voxels) == 2
     with pytest.raises(InputError, match=r"1 of 3 annotated voxels are unphysical.*sample\.max_un"):
         read_field(make_pair(grid=grid), 0.33)
@@ -261,25 +240,26 @@ def test_an_asset_fails_by_the_share_of_its_unphysical_voxels(make_pair):
 
 @pytest.mark.parametrize("material", [-1, 7], ids=["without class", "outside the object"])
 def test_values_of_a_voxel_that_is_not_annotated_do_not_matter(make_pair, material):
-    grid = raw_grid()
-    grid[30, 30, 30] = np.nan, -1, 9, material
+    grid = changed(RAW, ((30, 30, 30), (np.nan, -1, 9, material)))
     read = read_field(make_pair(grid=grid))
     assert read.voxels.tolist() == VOXELS
     assert read.unphysical == 0
 
 
-def _mask_with(value):
-    mask = mask_of(raw_grid())
-    mask[9, 8, 7] = value
-    return mask
-
-
 BAD_MASKS = {
     "empty": (np.zeros((64, 64, 64), bool), "mask is empty", "occupied voxel"),
     "shape": (np.ones((1, 64, 64, 64), bool), "shape (1, 64, 64, 64)", "shape (64, 64, 64)"),
-    "nan": (_mask_with(np.nan), "value nan at voxel (9, 8, 7)", "0 (empty) or 1 (occupied)"),
-    "255": (_mask_with(255).astype(np.uint8), "value 255 at voxel (9, 8, 7)", "0 (empty) or 1"),
-    "negative": (_mask_with(-1), "value -1.0 at voxel (9, 8, 7)", "0 (empty) or 1"),
+    "nan": (
+        changed(MASK, (CLASS[:3], np.nan)),
+        "value nan at voxel (9, 8, 7)",
+        "0 (empty) or 1 (occupied)",
+    ),
+    "255": (
+        changed(MASK, (CLASS[:3], 255)).astype(np.uint8),
+        "value 255 at voxel (9, 8, 7)",
+        "0 (empty) or 1",
+    ),
+    "negative": (changed(MASK, (CLASS[:3], -1)), "value -1.0 at voxel (9, 8, 7)", "0 (empty) or 1"),
     "text": (np.full((64, 64, 64), "1"), "dtype <U1", "boolean"),
 }
 
