@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from slatprep import ConfigError, open_store
-from slatprep.geometry.frames import voxel_centres
 from slatprep.learn import (
     FEATS_MEAN,
     FEATS_STD,
@@ -28,7 +27,7 @@ from slatprep.learn import (
     collate,
     split_of,
 )
-from slatprep.learn.augment import lattice_symmetries, move
+from slatprep.learn.augment import lattice_symmetries
 from slatprep.learn.decoder import (
     SIZES,
     DecoderSize,
@@ -140,17 +139,6 @@ def test_symmetries_are_the_groups_they_should_be():
         assert np.array_equal(matrices[0], np.eye(3))
         assert all((a @ b).tobytes() in known for a in matrices for b in matrices)
         assert all(np.array_equal(m @ m.T, np.eye(3)) for m in matrices)
-
-
-def test_moving_turns_the_centres():
-    coords = np.random.default_rng(0).integers(0, 64, (50, 3)).astype(np.int32)
-    for matrix in lattice_symmetries("all"):
-        moved = move(coords, matrix)
-        np.testing.assert_allclose(
-            voxel_centres(moved.astype(np.uint8)),
-            voxel_centres(coords.astype(np.uint8)) @ matrix.T,
-            atol=1e-12,
-        )
 
 
 def test_augmentation_moves_coordinates_and_nothing_else(learn_store):

@@ -176,7 +176,7 @@ def test_a_decoder_is_trained_and_used_on_its_grid(demo, tmp_path):
     run("evaluate", out, "--store", demo / "s.zarr", "--split", "all")
 
 
-@pytest.mark.parametrize("side", [32, 96])
+@pytest.mark.parametrize("side", [32, 64, 96])
 def test_voxels_of_any_grid_turn_about_its_centre(side):
     coords = np.random.default_rng(0).integers(0, side, (50, 3)).astype(np.int32)
     for matrix in lattice_symmetries("all"):
