@@ -18,6 +18,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from slatprep.errors import SlatprepError
 from slatprep.geometry.frames import voxel_centres
@@ -25,7 +27,7 @@ from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.particles.fields import stored_field
 from slatprep.particles.read import read_particles
-from slatprep.particles.simulate import rigid_deviation, simulate_motion, strain
+from slatprep.particles.simulate import simulate_motion
 from slatprep.particles.transfer import transfer, write_transferred
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
@@ -120,6 +122,38 @@ def require_elastic(store: Store, name: str) -> None:
         raise SlatprepError(
             f"{name} has {', '.join(words[0])}; expected an object of {', '.join(words[1])} alone"
         )
+
+
+def strain(rest: np.ndarray, moved: np.ndarray, part: np.ndarray, spacing: float) -> np.ndarray:
+    """Return the largest principal Green-Lagrange strain (F^T F - I) / 2 around each particle (N,).
+
+    F is the least-squares fit to the motion of those of the 26 neighbours on the lattice at rest
+    that are of the same `part` (N,); NaN if they do not span the space. Rigid motion has none.
+    """
+    pairs = cKDTree(rest).query_pairs(1.8 * spacing, output_type="ndarray")
+    pairs = pairs[part[pairs[:, 0]] == part[pairs[:, 1]]]
+    here, there = np.concatenate([pairs, pairs[:, ::-1]]).T
+    old, new = rest[there] - rest[here], moved[there] - moved[here]
+    spread, motion = np.zeros((2, len(rest), 3, 3))
+    np.add.at(spread, here, old[:, :, None] * old[:, None, :])
+    np.add.at(motion, here, new[:, :, None] * old[:, None, :])
+    spans = np.linalg.eigvalsh(spread)[:, 0] > 1e-3 * spacing**2
+    gradient = motion[spans] @ np.linalg.inv(spread[spans])
+    green = (gradient.transpose(0, 2, 1) @ gradient - np.eye(3)) / 2
+    result = np.full(len(rest), np.nan)
+    result[spans] = np.abs(np.linalg.eigvalsh(green)).max(axis=1)
+    return result
+
+
+def rigid_deviation(rest: np.ndarray, moved: np.ndarray) -> float:
+    """Return the root mean square distance of points (N, 3), N >= 3, from their best rigid motion.
+
+    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta
+    Crystallographica A32 (1976).
+    """
+    before, after = rest - rest.mean(axis=0), moved - moved.mean(axis=0)
+    turn, _ = Rotation.align_vectors(after, before)
+    return float(np.sqrt(((turn.apply(before) - after) ** 2).sum(axis=1).mean()))
 
 
 def chosen_frames(count: int, height: float, worst: int) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ from slatprep.errors import ConfigError, SlatprepError
 
 GROUPS = {
     "Make and build": {
-        "make-demo": "slatprep.cli.demo:make_demo",
+        "make-demo": "slatprep.cli.build:make_demo",
         "extract-slat": "slatprep.cli.latents:extract_slat",
         "build-store": "slatprep.cli.build:build_store",
         "align": "slatprep.cli.build:align",
@@ -41,9 +41,9 @@ GROUPS = {
         "publish": "slatprep.cli.export:publish",
     },
     "Learn": {
-        "train": "slatprep.cli.train:train",
-        "predict": "slatprep.cli.predict:predict",
-        "evaluate": "slatprep.cli.evaluate:evaluate",
+        "train": "slatprep.cli.learn:train",
+        "predict": "slatprep.cli.learn:predict",
+        "evaluate": "slatprep.cli.learn:evaluate",
     },
     "Maintain": {
         "verify": "slatprep.cli.verify:verify",

@@ -1,4 +1,4 @@
-"""Simulate particles that fall or stand in the wind, and measure their deformation.
+"""Simulate particles that fall or stand in the wind.
 
 The engine is Newton's implicit material point method (Linux Foundation,
 https://github.com/newton-physics/newton), which runs on a CPU. It is implicit, so one time step
@@ -142,46 +142,6 @@ def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[n
         upwind[:, axis] -= int(np.sign(part))
         area += abs(part) * ~taken[tuple(upwind.T)]
     return area * spacing**2
-
-
-def strain(
-    rest: ArrayLike, moved: ArrayLike, part: ArrayLike, spacing: float
-) -> NDArray[np.float64]:
-    """Return the largest principal Green-Lagrange strain (F^T F - I) / 2 around each particle (N,).
-
-    F is the least-squares fit to the motion of those of the 26 neighbours on the lattice at rest
-    that are of the same `part` (N,); NaN if they do not span the space. Rigid motion has none.
-    """
-    from scipy.spatial import cKDTree
-
-    before, after, label = np.asarray(rest), np.asarray(moved), np.asarray(part)
-    pairs = cKDTree(before).query_pairs(1.8 * spacing, output_type="ndarray")
-    pairs = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]]
-    here, there = np.concatenate([pairs, pairs[:, ::-1]]).T
-    old, new = before[there] - before[here], after[there] - after[here]
-    spread, motion = np.zeros((2, len(before), 3, 3))
-    np.add.at(spread, here, old[:, :, None] * old[:, None, :])
-    np.add.at(motion, here, new[:, :, None] * old[:, None, :])
-    spans = np.linalg.eigvalsh(spread)[:, 0] > 1e-3 * spacing**2
-    gradient = motion[spans] @ np.linalg.inv(spread[spans])
-    green = (gradient.transpose(0, 2, 1) @ gradient - np.eye(3)) / 2
-    result = np.full(len(before), np.nan)
-    result[spans] = np.abs(np.linalg.eigvalsh(green)).max(axis=1)
-    return result
-
-
-def rigid_deviation(rest: ArrayLike, moved: ArrayLike) -> float:
-    """Return the root mean square distance of points (N, 3), N >= 3, from their best rigid motion.
-
-    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta
-    Crystallographica A32 (1976).
-    """
-    from scipy.spatial.transform import Rotation
-
-    old, new = np.asarray(rest, dtype=np.float64), np.asarray(moved, dtype=np.float64)
-    before, after = old - old.mean(axis=0), new - new.mean(axis=0)
-    turn, _ = Rotation.align_vectors(after, before)
-    return float(np.sqrt(((turn.apply(before) - after) ** 2).sum(axis=1).mean()))
 
 
 def _check(
