@@ -1,4 +1,4 @@
-"""The truth of demo assets, from the voxels themselves; distances of shapes and their voxels."""
+"""The truth of demo assets, from the voxels and the maps inverted by numbers; shapes, voxels."""
 
 from functools import cache
 
@@ -6,21 +6,40 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import binary_erosion, generate_binary_structure, label
+from scipy.ndimage import (
+    binary_erosion,
+    binary_fill_holes,
+    distance_transform_edt,
+    generate_binary_structure,
+    label,
+    map_coordinates,
+)
+from scipy.optimize import least_squares, root
 from scipy.spatial import cKDTree
 
 from slatprep.demo import shapes
 from slatprep.demo.asset import make_asset, object_id
 from slatprep.demo.catalogue import CATALOGUE
-from slatprep.demo.difficulty import LEVELS, QUARTER_TURNS, SAME_SHAPE_LEVELS, draw_frames
+from slatprep.demo.difficulty import (
+    LEVELS,
+    QUARTER_TURNS,
+    SAME_SHAPE_LEVELS,
+    draw_frames,
+    generate,
+)
+from slatprep.demo.generated import draw_distortion
 from slatprep.demo.latents import MEAN, STD
 from slatprep.demo.model import MATERIALS, direction, orient, rock, vessel
+from slatprep.demo.nerf import UNLABELLED, nerf_field
 from slatprep.demo.shapes import Part, Solid, Stuff
 from slatprep.demo.voxelise import voxelise
 from slatprep.geometry.frames import voxel_centres
+from slatprep.geometry.voxels import occupancy_of
 
 KINDS = range(2 * len(CATALOGUE))
 """Two turns through the categories: the first two kinds of each."""
+
+SOME = [list(CATALOGUE).index(c) for c in ("flowers", "rubber_ducks_and_toys", "soda_cans")]
 
 
 @cache
@@ -28,21 +47,14 @@ def asset(index, level, **options):
     return make_asset(11, index, levels=(level,), **options)
 
 
-def looked_up(made, view=0):
-    """Map SLAT voxel centres into the grid's frame by the inverse of the true transform."""
-    centres = (made.views[view].coords + 0.5) / 64 - 0.5
-    inverse = np.linalg.inv(made.views[view].transform)
-    return centres @ inverse[:3, :3].T + inverse[:3, 3]
+def centres_of(view):
+    return (view.coords + 0.5) / 64 - 0.5
 
 
-def label_share(made):
-    ids = made.grid[..., 3]
-    annotated = np.argwhere((ids >= 0) & (ids < 7))
-    distance, nearest = cKDTree((annotated + 0.5) / 64 - 0.5).query(looked_up(made))
-    voxels = tuple(annotated[nearest].T)
-    near = distance * 64 <= 2
-    right = ids[voxels] == made.views[0].material
-    return right[near].mean(), near.mean()
+def looked_up(view):
+    """Return where SLAT voxels truly lie in the grid's frame, by the inverse of the transform."""
+    centres = centres_of(view) - view.transform[:3, 3]
+    return centres @ np.linalg.inv(view.transform[:3, :3]).T
 
 
 @pytest.mark.parametrize("index", KINDS)
@@ -51,9 +63,7 @@ def test_quarter_turn_is_an_exact_permutation_of_the_axes(index):
     turn = made.views[0].transform[:3, :3]
     assert any(np.allclose(turn, quarter, atol=1e-12) for quarter in QUARTER_TURNS)
     assert np.allclose(made.views[0].transform[:3, 3], 0, atol=1e-12)
-    voxels = np.rint((looked_up(made) + 0.5) * 64 - 0.5).astype(int)
-    surface = np.zeros((64,) * 3, dtype=bool)
-    surface[tuple(voxels.T)] = True
+    surface = occupancy_of(np.rint((looked_up(made.views[0]) + 0.5) * 64 - 0.5).astype(int))
     # The filled grid holds every surface voxel, and whatever of it is not one
     # lies inside: no face of it is bare.
     assert not np.any(surface & ~made.occupancy)
@@ -68,23 +78,34 @@ def test_quarter_turn_is_an_exact_permutation_of_the_axes(index):
 
 
 @pytest.mark.parametrize("index", KINDS)
-def test_true_transform_lands_on_the_object_and_on_its_material(index):
+def test_true_transform_lands_on_the_object(index):
     made = asset(index, 1)
     occupied = (np.argwhere(made.occupancy) + 0.5) / 64 - 0.5
-    distance = cKDTree(occupied).query(looked_up(made))[0] * 64
+    distance = cKDTree(occupied).query(looked_up(made.views[0]))[0] * 64
     # A SLAT voxel's centre is within half a diagonal of the surface, and the
     # surface within another half of the centre of a voxel that it meets.
     assert distance.max() <= 3**0.5
     assert np.quantile(distance, 0.98) <= 1.0
-    right, near = label_share(made)
-    assert right > 0.97 and near == 1.0
 
 
-@pytest.mark.parametrize("index", range(len(CATALOGUE)))
-@pytest.mark.parametrize(("levels", "least"), [((2, 3), 0.95), ((4,), 0.93)])
-def test_true_transform_of_harder_levels_finds_the_material(index, levels, least):
-    right, near = label_share(asset(index, levels[index % len(levels)]))
-    assert right > least and near > 0.9
+@pytest.mark.parametrize(("index", "level", "least", "near"), [
+    *((index, 1, 0.97, 1.0) for index in KINDS),
+    *((index, 2 + index % 2, 0.95, 0.9) for index in range(len(CATALOGUE))),
+    *((index, 4, 0.93, 0.9) for index in range(len(CATALOGUE))),
+    *((index, level, 0.97, 0.95) for index in SOME for level in (5, 6, 7)),
+])  # fmt: skip
+def test_labels_are_those_at_the_true_places(index, level, least, near):
+    made = asset(index, level)
+    (view,) = made.views
+    places = looked_up(view) if view.places is None else view.places
+    annotated = np.argwhere((made.grid[..., 3] >= 0) & (made.grid[..., 3] < 7))
+    distance, nearest = cKDTree((annotated + 0.5) / 64 - 0.5).query(places)
+    within = distance * 64 <= 2
+    assert within.mean() >= near
+    density, modulus, ratio, material = made.grid[tuple(annotated[nearest].T)].T
+    assert (material == view.material)[within].mean() > least
+    same = np.all(np.stack([modulus, density, ratio], axis=1) == view.properties, axis=1)
+    assert same[within].mean() > least - 0.02
 
 
 @pytest.mark.parametrize("index", KINDS)
@@ -115,8 +136,7 @@ def test_properties_follow_the_material_and_stay_in_the_published_span(index):
 def test_symmetric_says_whether_another_quarter_turn_fits_as_well(index):
     made = asset(index, 0)
     voxels = made.views[0].coords.astype(int)
-    surface = np.zeros((64,) * 3, dtype=bool)
-    surface[tuple(voxels.T)] = True
+    surface = occupancy_of(voxels)
     overlaps = []
     for turn in QUARTER_TURNS:
         if not np.array_equal(turn, np.eye(3)):
@@ -226,6 +246,167 @@ def test_every_category_has_a_builder_and_every_object_an_id():
     assert len(set(ids)) == 200
     assert all(len(i) == 32 and set(i) <= set("0123456789abcdef") for i in ids)
 
+
+# -- shapes that differ
+
+CUBE = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
+
+
+def distortion(seed):
+    return draw_distortion(np.random.default_rng(seed), CUBE, 2.0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_distortion_folds_nowhere_and_keeps_its_bound(seed):
+    shape = distortion(seed)
+    points = np.random.default_rng(1).uniform(-0.7, 0.7, (3_000, 3))
+    step = 1e-5
+    columns = [
+        (shape(points + step * e) - shape(points - step * e)) / (2 * step) for e in np.eye(3)
+    ]
+    jacobian = np.stack(columns, axis=-1)
+    assert np.linalg.det(jacobian).min() > 0.2
+    assert np.linalg.norm(jacobian, 2, axis=(1, 2)).max() <= shape.stretch
+    assert np.allclose(shape(shape.inverse(points)), points, atol=1e-9)
+
+
+def test_a_distortion_is_as_far_off_as_its_level_says():
+    points = np.random.default_rng(2).uniform(-0.5, 0.5, (5_000, 3))
+    seen, unseen, errors = [], [], []
+    for seed in range(15):
+        shape = distortion(seed)
+        errors.append(np.sort(np.abs(shape.proportions - 1.0)))
+        # Without the proportions what is left is the bend.
+        bend = 64 * np.linalg.norm(shape(points) * shape.proportions - points, axis=1)
+        side = points @ shape.away
+        seen.append((bend[side < -0.25] ** 2).mean())
+        unseen.append((bend[side > 0.25] ** 2).mean())
+    errors = np.array(errors)
+    assert not errors[:, :2].any()
+    assert 0.1 <= errors[:, 2].min() <= errors[:, 2].max() <= 0.25
+    near, far = np.sqrt(np.mean(seen)), np.sqrt(np.mean(unseen))
+    assert far / near == pytest.approx(2.0, rel=0.2)
+    assert np.sqrt((near**2 + far**2) / 2) == pytest.approx(2.0, rel=0.2)
+
+
+def test_places_are_where_the_maps_inverted_by_numbers_put_them():
+    """A point of the object is sent to both sides; its place must lead from one to the other."""
+    rng = np.random.default_rng(5)
+    solid = Solid(CATALOGUE["tree"](rng, 0).parts)
+    frames = draw_frames(rng, solid, LEVELS[5], QUARTER_TURNS[7])
+    skin = rng.uniform(*solid.extent, (500, 3))
+    frames = generate(rng, frames, LEVELS[5].bend, solid, skin)
+    shape, slat = frames.distortion, frames.slat
+    waves = shape.waves
+    wanted = skin[:20]
+
+    def object_of(y):
+        q = (y - shape.middle) / shape.size
+        growth = 1.0 + np.tanh(4.0 * (shape.away @ q)) / 3.0
+        bend = sum(
+            a * np.sin(k @ q + p)
+            for a, k, p in zip(waves.amplitude, waves.wave, waves.phase, strict=True)
+        )
+        return shape.middle + shape.size * (q + growth * bend) / shape.proportions
+
+    for point in wanted:
+        found = root(lambda y, p=point: object_of(y) - p, point, tol=1e-13)
+        assert found.success
+        in_slat, in_pixieverse = (
+            pose.scale * pose.rotation @ (there - pose.centre) + pose.shift
+            for pose, there in ((slat, found.x), (frames.pixieverse, point))
+        )
+        assert np.allclose(frames.places(in_slat[None])[0], in_pixieverse, atol=1e-10)
+
+
+@pytest.mark.parametrize("level", [5, 7])
+@pytest.mark.parametrize("index", SOME)
+def test_transform_is_the_similarity_with_the_least_squares(index, level):
+    (view,) = asset(index, level).views
+    centres = centres_of(view)
+
+    def residuals(x):
+        turn = np.cross(np.eye(3), x[:3]).T
+        linear = np.exp(x[3]) * (np.eye(3) + turn + turn @ turn / 2) @ view.transform[:3, :3]
+        return (view.places @ linear.T + view.transform[:3, 3] + x[4:] - centres).ravel()
+
+    # To second order in the turn it is a similarity: the gradient tells, and the step.
+    found = least_squares(residuals, np.zeros(7), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert np.abs(found.x).max() < 1e-6
+    off = 64 * np.linalg.norm(looked_up(view) - view.places, axis=1)
+    assert 0.7 < off.mean() < 4.5
+    # It nearly fills the cube: where a surface left it, the outermost layer would show the cut.
+    coords = view.coords.astype(int)
+    faces = (coords == 0) | (coords == 63)
+    assert faces.any(axis=1).sum() < 0.01 * len(coords)
+    assert (coords.max(axis=0) - coords.min(axis=0)).max() >= 57
+
+
+@pytest.mark.parametrize("index", SOME)
+def test_without_another_shape_the_transform_leads_to_the_places(index):
+    (view,) = asset(index, 6).views
+    assert np.allclose(looked_up(view), view.places, atol=1e-12)
+
+
+def test_each_view_of_a_generated_asset_is_another_shape():
+    first, second = asset(SOME[1], 5, views=2).views
+    turned = np.column_stack([63 - first.coords[:, 1].astype(int), first.coords[:, [0, 2]]])
+    shared = set(map(tuple, turned.tolist())) & set(map(tuple, second.coords.tolist()))
+    assert len(shared) < 0.5 * len(first.coords)
+    # And the first is what it is without the second.
+    alone = asset(SOME[1], 5).views[0]
+    assert np.array_equal(alone.coords, first.coords)
+    assert np.array_equal(alone.places, first.places)
+
+
+def block(low, high):
+    stuff = np.full((64, 64, 64), -1, np.int16)
+    stuff[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = 0
+    return stuff
+
+
+def test_a_nerf_field_is_thick_and_rough_with_hollows_and_blobs():
+    stuff = block((16, 16, 16), (48, 48, 40))
+    thick, hollow, blobs, unlabelled, grounds = [], [], [], [], 0
+    for seed in range(20):
+        field = nerf_field(np.random.default_rng(seed), stuff, np.array([0.0, 0.0, 1.0]), 3)
+        occupied = field != -1
+        pieces, count = label(occupied, np.ones((3, 3, 3)))
+        body = pieces == pieces[16, 32, 38]
+        unlabelled.append((field == UNLABELLED).sum())
+        blobs.append(count - 1)
+        hollow.append((binary_fill_holes(occupied) & ~occupied).sum())
+        # Above the block's middle nothing of the ground is seen.
+        signed = np.where(body, 0.5 - distance_transform_edt(body), 0)
+        signed += np.where(body, 0, distance_transform_edt(~body) - 0.5)
+        u, v = np.meshgrid(np.arange(22.0, 42.0), np.arange(28.0, 38.0))
+        face = np.stack([np.full(u.size, 15.5), u.ravel(), v.ravel()])
+        thick.append(-map_coordinates(signed, face, order=1))
+        grounds += occupied[20:44, 20:44, 14].mean() > 0.9
+    assert np.mean(thick) == pytest.approx(0.5, abs=0.2) and 0.3 < np.std(thick) < 1.0
+    assert np.mean(np.array(hollow) > 0) > 0.9
+    assert min(blobs) >= 1 and min(unlabelled) > 0
+    assert 0.15 < grounds / 20 < 0.55
+
+
+def test_a_nerf_field_loses_some_thin_parts_but_never_the_object():
+    stuff = block((16, 16, 16), (48, 48, 32))
+    for x in range(18, 48, 6):
+        for y in range(18, 48, 6):
+            stuff[x : x + 2, y : y + 2, 32:52] = 1
+    lost = []
+    for seed in range(10):
+        field = nerf_field(np.random.default_rng(seed), stuff, np.array([0.0, 0.0, 1.0]), 2)
+        rods = stuff == 1
+        lost.append((field[rods] == -1).mean())
+        assert (field[stuff >= 0] == -1).sum() < 0.3 * (stuff >= 0).sum()
+    assert 0.02 < np.mean(lost) < 0.9
+    only_thin = np.where(stuff == 1, np.int16(0), np.int16(-1))
+    field = nerf_field(np.random.default_rng(0), only_thin, np.array([0.0, 0.0, 1.0]), 1)
+    assert ((field == 0) & (only_thin == 0)).sum() > 0.6 * (only_thin == 0).sum()
+
+
+# -- shapes and their voxels
 
 SHAPES = {
     "sphere": shapes.sphere((0.1, 0.0, -0.1), 0.3),

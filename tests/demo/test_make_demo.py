@@ -63,6 +63,7 @@ def test_layout_is_that_of_the_real_data(demo):
             assert np.array_equal(truth["transform"], entry["rows"][0]["transform"])
             for name in ("name", "level", "symmetric"):
                 assert truth[name].item() == entry[name]
+            assert "places" not in truth
         is_good = {"vlm_filtering": {"is_appropriate": True}}
         assert metadata[uid] == {"obj_class": entry["category"]} | is_good
 
@@ -130,6 +131,15 @@ def test_slat_forms_hold_the_same_voxels(tmp_path):
     assert tomllib.loads((root / "dataset.toml").read_text())["slat"]["root"] == "slat/latents.h5"
     make_demo(root, 2, 7, slat_form="hdf5-groups")
     assert tree(root) == first
+
+
+def test_truth_files_name_places_where_shapes_differ(tmp_path):
+    make_demo(tmp_path, 2, 3, levels=(6, 7))
+    for path in (tmp_path / "truth").glob("*.npz"):
+        with np.load(path) as truth:
+            assert truth["places"].dtype == np.float64
+            assert truth["places"].shape == (len(truth["material"]), 3)
+            assert np.abs(truth["places"]).max() <= 0.5
 
 
 def test_several_views_are_several_rows_of_one_object(tmp_path):
@@ -288,7 +298,7 @@ def test_latents_of_every_encoder_are_carried(tmp_path, encoder):
 TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-@pytest.mark.parametrize("source", ["pixieverse", "physxnet", "voxels-npz"])
+@pytest.mark.parametrize("source", ["pixieverse", "physxnet"])
 def test_a_wrong_frame_of_any_source_is_caught(tmp_path, source):
     made = make_demo(tmp_path / "demo", 2, 0, levels=(0,), source=source)
     text = made.config.read_text()
