@@ -44,13 +44,15 @@ def test_a_subset_is_whole_whatever_happens_to_what_it_prints(mixed_build, tmp_p
     assert verify_store(out).ok
 
 
-def test_lost_notes_are_told_on_standard_output_and_never_within_json(mixed_build):
+def test_lost_notes_are_told_on_standard_output_and_never_within_json(mixed_build, tmp_path):
     store = mixed_build.store
-    done = shell(f"verify {store}", "2>&-")  # It notes how many files it read.
+    done = shell(f"describe {store}", "2>&-")  # It notes what is not stated.
     assert done.returncode == 3
     assert "standard error cannot be written to" in done.stdout
-    done = shell(f"verify {store} --json", "2>&-")
-    assert json.loads(done.stdout)["command"] == "verify"
+    # It notes how many objects are in each split.
+    done = shell(f"export {store} --format npz --out {tmp_path}/n --split train --json", "2>&-")
+    assert done.returncode == 3
+    assert json.loads(done.stdout)["command"] == "export"
 
 
 def test_a_reader_that_has_read_enough_is_no_fault(mixed_build):

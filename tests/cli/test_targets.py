@@ -11,18 +11,25 @@ from support.synthetic import Made
 from support.trees import tree
 
 
-@pytest.fixture
-def folder(undisturbed: Made, tmp_path: Path) -> Path:
-    """Sources, a store of them, its records, and predictions."""
+@pytest.fixture(scope="module")
+def kept(undisturbed: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sources, a store of them, its records, and predictions, which nobody may change."""
     dataset, store = undisturbed
-    shutil.copytree(dataset.root, tmp_path / "sources")
-    shutil.copytree(store, tmp_path / "s.zarr")
-    shutil.copytree(store.with_name("s.manifests"), tmp_path / "s.manifests")
-    (tmp_path / "predictions").mkdir()
-    (tmp_path / "predictions" / "a.npz").write_bytes(b"")
-    np.save(tmp_path / "p.npy", np.zeros((4, 3)))
-    (tmp_path / "ids.json").write_text("{}")
-    return tmp_path
+    folder = tmp_path_factory.mktemp("kept")
+    shutil.copytree(dataset.root, folder / "sources")
+    shutil.copytree(store, folder / "s.zarr")
+    shutil.copytree(store.with_name("s.manifests"), folder / "s.manifests")
+    (folder / "predictions").mkdir()
+    (folder / "predictions" / "a.npz").write_bytes(b"")
+    np.save(folder / "p.npy", np.zeros((4, 3)))
+    (folder / "ids.json").write_text("{}")
+    return folder
+
+
+@pytest.fixture
+def folder(kept: Path, tmp_path: Path) -> Path:
+    """Return a copy of all that, which may be changed."""
+    return Path(shutil.copytree(kept, tmp_path / "copy"))
 
 
 def run(line: str, folder: Path, code: int | None = None) -> Result:
@@ -70,14 +77,14 @@ OVER_WHAT_IS_READ = (
 
 
 @pytest.mark.parametrize("line", [*INTO_A_STORE, *OVER_WHAT_IS_READ])
-def test_refused_in_words_and_nothing_changes(folder, line):
-    before = tree(folder)
-    done = run(line, folder)
+def test_refused_in_words_and_nothing_changes(kept, line):
+    before = tree(kept)
+    done = run(line, kept)
     assert done.exit_code in (1, 2), done.output
     words = ("lies inside the store", "is a store", "lies in the store", "the command reads",
              "holds the records of")  # fmt: skip
     assert any(one in " ".join(done.stderr.split()) for one in words), done.stderr
-    assert tree(folder) == before
+    assert tree(kept) == before
 
 
 def test_neither_a_link_into_a_store_nor_a_device_is_replaced(folder):
