@@ -287,19 +287,6 @@ def test_prediction_in_si_needs_no_ranges(tmp_path):
         predicted(properties_si=values)
 
 
-def test_plain_points_are_taken_as_they_lie(tmp_path):
-    positions = np.array([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.4]])
-    write_points(tmp_path / "plain.ply", positions)
-    write_gaussians(tmp_path / "g.ply", positions)
-    np.save(tmp_path / "p.npy", positions)
-    for name in ("plain.ply", "g.ply", "p.npy"):
-        np.testing.assert_allclose(
-            read_particles(tmp_path / name).in_slat(), positions, atol=1e-7, err_msg=name
-        )
-    turned = read_particles(tmp_path / "p.npy", axes="trellis")
-    np.testing.assert_allclose(turned.in_slat(), positions[:, [0, 2, 1]] * [1, 1, -1])
-
-
 def test_a_file_that_transfer_did_not_write_is_not_replaced(store, tmp_path):
     own = tmp_path / "own.ply"
     write_gaussians(own, np.zeros((1, 3)))
