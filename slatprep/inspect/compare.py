@@ -272,7 +272,7 @@ def _changes(
     columns = np.stack([_unequal(a.column(name)[both[0]], b.column(name)[both[1]])
                         for name in names])  # fmt: skip
     verdicts = [store.column("verdict")[own] for store, own in zip((a, b), both, strict=True)]
-    sources = SourceStore(a.path), SourceStore(b.path)
+    sources = SourceStore(a), SourceStore(b)
     tasks = (
         (
             *sources,
@@ -303,17 +303,16 @@ _WORDS = {"voxel/material": "labels", "voxel/valid": "labels", "voxel/feats": "l
 
 
 def _compare(
-    source_a: SourceStore,
-    source_b: SourceStore,
+    a: SourceStore,
+    b: SourceStore,
     rows: tuple[int, int],
     verdicts: tuple[str, str],
     columns: Sequence[str],
 ) -> AssetChange:
     """Compare an asset, in a worker; its verdicts and the `columns` that differ are known."""
-    records = source_a.records.read(rows[0]), source_b.records.read(rows[1])
+    records = a.records.read(rows[0]), b.records.read(rows[1])
     digests = [{(one.role, one.sha256) for one in record.sources} for record in records]
     roles = {role for role, _ in digests[0] ^ digests[1]}
-    a, b = source_a.store, source_b.store
     one, other = a.read(rows[0], VOXEL_COLUMNS), b.read(rows[1], VOXEL_COLUMNS)
     coords = one.pop("coords"), other.pop("coords")
     unmatched, moved = 0, 0.0

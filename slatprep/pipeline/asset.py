@@ -128,7 +128,7 @@ def _repeated(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> 
     except StoreError:
         return None
     asset = process_asset(pair, context.parameters, known)
-    same = _key(asset, context.recipe) == planned.key and context.previous.holds(asset)
+    same = _key(asset, context.recipe) == planned.key and context.previous.gives(asset)
     return asset if same else None
 
 

@@ -77,9 +77,8 @@ class Before:
         """Whether sources, store and records are as the last build left them, and as asked for."""
         if self.previous is None or not self.as_left:
             return False
-        store = self.previous.store
-        same = len(self.known) == len(self.pairs) == len(store)
-        return same and self.wanted.allows(store)
+        same = len(self.known) == len(self.pairs) == len(self.previous)
+        return same and self.wanted.allows(self.previous)
 
     def holds(self, new: NextStore) -> bool:
         """Whether the store that is there is sound, and the one that would be written."""
@@ -93,7 +92,7 @@ class Before:
         """
         if not self.as_left or self.damaged or self.previous is None:
             return set()
-        names, old = file_names(assets), file_names(len(self.previous.store))
+        names, old = file_names(assets), file_names(len(self.previous))
         both = enumerate(zip(names, old, strict=False))
         return {name for k, (name, was) in both if name == was and (taken is None or k in taken)}
 
@@ -128,7 +127,7 @@ class Before:
 
     def _is_as_left(self, previous: SourceStore, state: bytes) -> bool:
         try:
-            assets, folder = len(previous.store), self.place.manifests()
+            assets, folder = len(previous), self.place.manifests()
             return any(state) and _store_state(self.place, folder, assets) == state
         except StoreError:  # Damaged: how many rows there are is not known.
             return False
@@ -164,11 +163,11 @@ def look_back(
     if fresh:
         return before
     try:
-        before.previous = previous = SourceStore(open_store(place.store).path)
+        before.previous = previous = SourceStore(open_store(place.store))
     except StoreError as error:
         before.damaged = (str(error),) if is_store(place.store) else ()
         return before
-    keys, state = read_seen(_seen_folder(place), before._bound_to(previous.store))
+    keys, state = read_seen(_seen_folder(place), before._bound_to(previous))
     before.as_left = before._is_as_left(previous, state)
     states = look(pairs) if keys and rehash < 1 else {}
     before.known = {name: (own, keys[own]) for name, own in states.items() if own in keys}

@@ -80,12 +80,12 @@ def subset_store(
         If the store lacks an asset, or cannot be read, or the disk does not take the new one.
     """
     source = _source(store)
-    held, everything = source.store, _rows([source])
-    rows = [everything[row] for row in {held.match(name) for name in assets}]
+    everything = _rows([source])
+    rows = [everything[row] for row in {source.match(name) for name in assets}]
     if not rows:
-        raise ConfigError(f"no asset of {held.path} is chosen; expected one at least")
+        raise ConfigError(f"no asset of {source.path} is chosen; expected one at least")
     place, parameters = Destination(out, manifests), _parameters([source], source.build)
-    how = source.normalization, held.contents, source.build, parameters.store
+    how = source.normalization, source.contents, source.build, parameters.store
     return _write(NextStore(_by_id(rows), (source,), *how), parameters, place, jobs, progress)
 
 
@@ -142,7 +142,7 @@ def concat_stores(
 
 
 def _source(place: str | Place) -> SourceStore:
-    return SourceStore(open_store(place).path.absolute())
+    return SourceStore(open_store(open_store(place).path.absolute()))
 
 
 def _rows(sources: Sequence[SourceStore]) -> list[Row]:
@@ -151,7 +151,7 @@ def _rows(sources: Sequence[SourceStore]) -> list[Row]:
         Row(asset_id, size, store=number, row=row)
         for number, source in enumerate(sources)
         for row, (asset_id, size) in enumerate(
-            zip(source.store.ids, np.diff(source.store.offsets).tolist(), strict=True)
+            zip(source.ids, np.diff(source.offsets).tolist(), strict=True)
         )
     ]
 
@@ -205,7 +205,7 @@ def _places_of_sources(store: SourceStore) -> dict[str, Any]:
         record = build_in(folder)
     except StoreError:
         return {}  # The store does not need it, and `slatprep verify` names it.
-    if record.id != store.store.about.manifest:
+    if record.id != store.about.manifest:
         return {}
     names = ("pixieverse", "also", "slat", "pairing")
     named = {name: getattr(record.parameters, name) for name in names}
@@ -229,7 +229,7 @@ def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildP
             orjson.dumps(document), strict=True
         )
     except ValueError as error:
-        path = sources[0].store.path
+        path = sources[0].path
         raise StoreError(
             f"{path}: its attribute build does not say how it was built ({error}); build it again"
         ) from None
@@ -245,7 +245,7 @@ def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:
             ours, theirs = (parameters.get(group) for parameters in both)
             if theirs != ours:
                 raise ConfigError(
-                    f"{other.store.path} was built with [{group}] {theirs}, {first.store.path} "
+                    f"{other.path} was built with [{group}] {theirs}, {first.path} "
                     f"with {ours}; expected the same: build one of them again"
                 )
     versions: dict[str, list[str]] = {}
@@ -261,13 +261,13 @@ def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:
 
 def _common_ranges(sources: Sequence[SourceStore]) -> Normalization:
     """Return the ranges that all have, or those that span all datasets'."""
-    ranges = [source.store.normalization for source in sources]
+    ranges = [source.normalization for source in sources]
     if all(one == ranges[0] for one in ranges):
         return ranges[0]
     for source, one in zip(sources, ranges, strict=True):
         if one.source != "dataset":
             raise ConfigError(
-                f"{source.store.path} has ranges from {one.source!r}, not those of the others; "
+                f"{source.path} has ranges from {one.source!r}, not those of the others; "
                 "expected the same in all, or in each those of its dataset: build with --ranges"
             )
     spans = (
@@ -284,21 +284,21 @@ def _in_words(space: LatentSpace) -> str:
 
 def _common_contents(sources: Sequence[SourceStore], rows: Sequence[Row]) -> Contents:
     """Return what all stores hold; moments of latents that a build measured are pooled."""
-    first = sources[0].store.contents
+    first = sources[0].contents
     for source in sources[1:]:
-        other = source.store.contents
+        other = source.contents
         for name in ("properties", "classes"):
             if getattr(other, name) != getattr(first, name):
                 raise ConfigError(
-                    f"{source.store.path} has other {name} than {sources[0].store.path}; "
+                    f"{source.path} has other {name} than {sources[0].path}; "
                     "expected the same tables in both"
                 )
         if replace(other.latents, mean=(), std=()) != replace(first.latents, mean=(), std=()):
             raise ConfigError(
-                f"{source.store.path} has latents of {_in_words(other.latents)}, "
-                f"{sources[0].store.path} of {_in_words(first.latents)}; expected the same"
+                f"{source.path} has latents of {_in_words(other.latents)}, "
+                f"{sources[0].path} of {_in_words(first.latents)}; expected the same"
             )
-    if all(source.store.contents == first for source in sources):
+    if all(source.contents == first for source in sources):
         return first
     unknown = replace(first, latents=replace(first.latents, mean=(), std=()))
     return resolved_contents(rows, sources, unknown, "as said")

@@ -205,10 +205,10 @@ def _copy_chunks(
 ) -> None:
     """Write whole chunks, rows ``start`` to ``stop - 1`` of an older store, as they are packed."""
     for array, writer in writers.items():
-        if not source.store.holds(array):
+        if not source.holds(array):
             writer.append_fill(stop - start)
             continue
-        reader = source.store.reader(array)
+        reader = source.reader(array)
         first, last = (-(-row // reader.chunk_rows) for row in (start, stop))
         for data, lengths in reader.packed(first, last):
             writer.append_packed(data, lengths)
@@ -228,17 +228,16 @@ def _move_rows(
             text = record_text(source, int(row), names).decode()
             _append(writers, {RECORD_ARRAY: np.array([text], object)}, 1)
         return
-    held = source.store
     (first, begin), (last, end) = assets[0], assets[-1]
-    edges = edges_of(shard.group, held.offsets.tolist())
+    edges = edges_of(shard.group, source.offsets.tolist())
     start = edges[int(shard.rows[first][1])] + begin.start
     stop = edges[int(shard.rows[last][1])] + end.stop
     change = _renormaliser(source.normalization, normalization)
-    names = [name for name in writers if held.holds(name)]
+    names = [name for name in writers if source.holds(name)]
     at_a_time = _ROWS_MOVED if shard.group == "voxel" else 1
     for at in range(start, stop, at_a_time):
         end_row = min(at + at_a_time, stop)
-        arrays = {name: change(held.read_rows(name, at, end_row), name) for name in names}
+        arrays = {name: change(source.read_rows(name, at, end_row), name) for name in names}
         _append(writers, arrays, end_row - at)
 
 
@@ -275,7 +274,7 @@ def _runs(path: Path, group: str, new: NextStore) -> Runs:
     alike = [_packs_alike(path, group, new, source) for source in new.stores]
     if not any(alike):
         return Runs()
-    before = [edges_of(group, source.store.offsets.tolist()) for source in new.stores]
+    before = [edges_of(group, source.offsets.tolist()) for source in new.stores]
     ends = edges_of(group, new.offsets)
     spans = (
         Run(ends[k], ends[k + 1], row.store, before[row.store][row.row] - ends[k])
@@ -289,7 +288,7 @@ def _packs_alike(path: Path, group: str, new: NextStore, source: SourceStore) ->
     """Whether a store has a group's values as the new one, in chunks cut and packed alike."""
     if group != "record" and source.normalization != new.normalization:
         return False
-    held = (name for name in arrays_in(group, new.merged) if source.store.holds(name))
+    held = (name for name in arrays_in(group, new.merged) if source.holds(name))
     return all(packing_of(path / name) == packing_of(source.path / name) for name in held)
 
 
@@ -297,7 +296,7 @@ def _taken(new: NextStore, runs: Mapping[str, Runs]) -> set[tuple[str, int]]:
     """Return the shards, by group and number, that are files of the store that is replaced."""
     if not (new.replaces and new.stores):
         return set()
-    held, taken = new.stores[0].store, set()
+    held, taken = new.stores[0], set()
     for group, (_, rows) in cuts_of(new.parameters, new.offsets[-1]).items():
         names = arrays_in(group, new.merged)
         if not all(held.holds(n) and held.reader(n).shard_rows == rows for n in names):
@@ -319,7 +318,7 @@ def _take(path: Path, new: NextStore, taken: Collection[tuple[str, int]]) -> dic
         source = new.stores[0]
         local = storage_of(source.path).local
         for name in arrays_in(group, new.merged):
-            file = source.store.reader(name).key(number)
+            file = source.reader(name).key(number)
             if local is not None:
                 take_file(local / file, path / file)
             files[file] = source.files[file]

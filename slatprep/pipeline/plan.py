@@ -184,7 +184,7 @@ def plan_assets(
         plan[planned.asset_id] = planned
         if crew.progress:
             crew.progress(len(plan), len(pairs))
-    gone = context.previous.ids - {pair.asset_id for pair in pairs} if context.previous else ()
+    gone = set(context.previous.ids if context.previous else ()) - {one.asset_id for one in pairs}
     why = "no longer among the sources"
     plan |= {asset_id: PlannedAsset(asset_id, Action.REMOVE, why) for asset_id in gone}
     return dict(sorted(plan.items()))

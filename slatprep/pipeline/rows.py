@@ -39,14 +39,16 @@ machine may round the map otherwise."""
 _NEEDED = ("asset/id/", "asset/offset/", f"{RECORD_ARRAY}/zarr.json", "file")
 
 
-class SourceStore:
-    """A store that assets are taken from; each process that gets one opens it once.
+class SourceStore(Store):
+    """An open store that assets are taken from; each process that gets one opens it once.
 
     `damaged` are files of its records that are not as they were written.
     """
 
-    def __init__(self, path: Place, damaged: frozenset[str] = frozenset()) -> None:
-        self.path = path
+    def __init__(self, store: Store, damaged: frozenset[str] = frozenset()) -> None:
+        gathered = {"metadata": store.metadata}
+        document = {"attributes": store.attributes, "consolidated_metadata": gathered}
+        super().__init__(store.path, document)
         self.damaged = damaged
         # A process that lives on must not answer with what it read of an older store at the same
         # path, whose rows may have been in another order under the same id.
@@ -55,44 +57,29 @@ class SourceStore:
     def __reduce__(self) -> tuple[Callable[..., SourceStore], tuple[object, ...]]:
         return _in_this_process, (self.path, self.damaged, self._run)
 
-    @cached_property
-    def store(self) -> Store:
-        """The store, open."""
-        return open_store(self.path)
-
-    @cached_property
-    def normalization(self) -> Normalization:
-        """The ranges of its properties."""
-        return self.store.normalization
-
     @property
     def build(self) -> dict[str, Any]:
         """Its attribute ``build``."""
-        return dict(self.store.attributes["build"])
+        return dict(self.attributes["build"])
 
     @cached_property
     def files(self) -> dict[str, Written]:
         """Bytes and SHA-256 of its files by name, as it holds them."""
-        return digests_in(self.store)
+        return digests_in(self)
 
     @cached_property
     def records(self) -> StoredRecords:
         """Its records."""
-        return StoredRecords(self.store)
-
-    @cached_property
-    def ids(self) -> frozenset[str]:
-        """Ids of its assets."""
-        return frozenset(self.store.ids)
+        return StoredRecords(self)
 
     def record(self, asset_id: str) -> AssetRecord | None:
         """Return the record of an asset as its first pass left it, None where it is not there.
 
         Raises StoreError if its file is damaged, or another version of slatprep wrote it.
         """
-        if asset_id not in self.ids:
+        if asset_id not in self:
             return None
-        row = self.store.find(asset_id)
+        row = self.find(asset_id)
         file = f"{RECORD_ARRAY}/c/{row // RECORDS_IN_SHARD}"
         if file in self.damaged:
             raise StoreError(f"{file} is damaged")
@@ -102,15 +89,15 @@ class SourceStore:
         """Return the record of a row as the store holds it, JSON in UTF-8."""
         return self.records.text(row).encode()
 
-    def holds(self, asset: Finished) -> bool:
+    def gives(self, asset: Finished) -> bool:
         """Whether the store's labels and places of an asset are those it has been given now.
 
         Where a pass over the whole dataset chose another alignment, the rows are of that one,
         and its places alone are compared.
         """
-        row = self.store.find(asset.pair.asset_id)
+        row = self.find(asset.pair.asset_id)
         try:
-            held = self.store.read(row, ("place", "material"))
+            held = self.read(row, ("place", "material"))
             record = self.records.read(row)
         except StoreError:
             return False
@@ -125,7 +112,7 @@ class SourceStore:
 
 @lru_cache(maxsize=16)
 def _in_this_process(path: Place, damaged: frozenset[str], run: str) -> SourceStore:
-    return SourceStore(path, damaged)
+    return SourceStore(open_store(path), damaged)
 
 
 def checked_store(
@@ -137,13 +124,13 @@ def checked_store(
     against their digests; of the others the sizes are compared. What is wrong is in words,
     sorted by file.
     """
-    findings = {*metadata_findings(source.path), *file_findings(source.store, jobs, below)[1]}
+    findings = {*metadata_findings(source.path), *file_findings(source, jobs, below)[1]}
     damaged = tuple(map(str, sorted(findings)))
     files = frozenset(finding.file for finding in findings)
     if any(file.startswith(_NEEDED) for file in files):
         return None, damaged
     records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
-    return SourceStore(source.path, records), damaged
+    return SourceStore(open_store(source.path), records), damaged
 
 
 IN_SPOOL = -1
@@ -284,7 +271,7 @@ class NextStore:
 
     def same_as(self, other: SourceStore) -> bool:
         """Whether another store is this one: the same build, in the same order of rows."""
-        return self.build_id == other.store.about.manifest and self.ids == other.store.ids
+        return self.build_id == other.about.manifest and self.ids == other.ids
 
     def column(self, name: str) -> NDArray[Any]:
         """Return an ``asset/*`` array by its last name; of what packing clips, what is known."""
@@ -314,7 +301,7 @@ def column(name: str, rows: Sequence[Row], stores: Sequence[SourceStore]) -> NDA
     for number, source in enumerate(stores):
         at = [k for k, row in enumerate(rows) if row.store == number]
         if at:
-            parts.append((at, source.store.column(name)[[rows[k].row for k in at]]))
+            parts.append((at, source.column(name)[[rows[k].row for k in at]]))
     first = np.asarray(parts[0][1])
     values = np.empty(
         (len(rows), *first.shape[1:]), object if first.dtype.kind == "U" else first.dtype
@@ -343,7 +330,7 @@ def in_order(rows: Sequence[Row], previous: SourceStore | None, compact: bool) -
     by_id = sorted(rows, key=lambda row: row.asset_id)
     if compact or previous is None:
         return by_id
-    place = {asset_id: row for row, asset_id in enumerate(previous.store.ids)}
+    place = {asset_id: row for row, asset_id in enumerate(previous.ids)}
     new = sum(row.asset_id not in place for row in rows)
     if new > MOST_BEHIND * len(place):
         return by_id

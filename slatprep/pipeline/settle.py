@@ -74,19 +74,19 @@ def kept_rows(
     previous, wanted = before.previous, before.wanted
     if previous is None or before.damaged or not unchanged:
         return []
-    store, declared = previous.store, wanted.declared
-    tables = [(one.properties, one.classes) for one in (store.contents, declared)]
+    declared = wanted.declared
+    tables = [(one.properties, one.classes) for one in (previous.contents, declared)]
     if tables[0] != tables[1] or {**previous.build, "name": ""} != {**wanted.build, "name": ""}:
         return []
-    sizes, rows = np.diff(store.offsets).tolist(), []
+    sizes, rows = np.diff(previous.offsets).tolist(), []
     for planned in (plan[pair.asset_id] for pair in unchanged):
-        row = store.find(planned.asset_id)
+        row = previous.find(planned.asset_id)
         names, seen = planned.names, planned.seen
         rows.append(Row(planned.asset_id, sizes[row], store=0, row=row, names=names, seen=seen))
     everything = [*rows, *(asset for asset in made if isinstance(asset, Row))]
-    if len(everything) == len(rows) == len(store) and not any(row.names for row in rows):
+    if len(everything) == len(rows) == len(previous) and not any(row.names for row in rows):
         # Whatever made ranges and placements of these assets would make the same again.
-        return rows if wanted.has_ranges(store) else []
+        return rows if wanted.has_ranges(previous) else []
     if wanted.passes:
         return []
     ranges = wanted.ranges
@@ -95,7 +95,7 @@ def kept_rows(
             return []  # Such ranges are of the values of all fields.
         extents = column("extent", everything, (previous,))
         ranges = ranges_from_extents(extents, ranges, declared.properties)
-    return rows if ranges == store.normalization else []
+    return rows if ranges == previous.normalization else []
 
 
 def resolved_contents(

@@ -366,10 +366,10 @@ def test_a_worker_that_lives_on_reads_the_store_of_today(built):
     build_store(dataset.parameters(), out)
 
     def in_the_worker() -> list[str]:
-        there = SourceStore(out)
+        there = SourceStore(open_store(out))
         worker = pickle.loads(pickle.dumps(there))
-        ids = worker.store.ids
-        assert [worker.store.asset(one).asset_id for one in ids] == list(ids)
+        ids = worker.ids
+        assert [worker.asset(one).asset_id for one in ids] == list(ids)
         return list(ids)
 
     assert in_the_worker() == ["a", "c", "e", "g", "b"]

@@ -120,7 +120,7 @@ def write_report(
     drawn: list[Drawn] = []
     tallies: dict[str, Tally] = {}
     categories = list(map(str, store.column("category")))
-    source = SourceStore(store.path)
+    source = SourceStore(store)
     for one, counts in run_unordered(draw_asset, ((source, row) for row in chosen), jobs):
         drawn.append(one)
         category = categories[one.index]

@@ -89,11 +89,10 @@ class Drawn:
     spreads: tuple[float, ...] = ()
 
 
-def draw_asset(source: SourceStore, row: int) -> tuple[Drawn, Tally]:
+def draw_asset(store: SourceStore, row: int) -> tuple[Drawn, Tally]:
     """Draw an asset of a store and tally its voxels, in a worker."""
-    store = source.store
     asset = store.asset(row)
-    way = source.records.place_map(asset)
+    way = store.records.place_map(asset)
     voxels = {side: encode_asset(asset, way, side) for side in (FULL, COARSE)}
     field = asset.grid_material, asset.grid_properties
     slat = asset.material, asset.properties

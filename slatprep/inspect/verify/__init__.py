@@ -166,7 +166,7 @@ def verify_store(
         findings.add(Finding("asset", "", str(error), "readable ids and offsets"))
         rows = []
     hashed, total = 0, len(rows)
-    source, compared = SourceStore(store.path), roots if sources else None
+    source, compared = SourceStore(store), roots if sources else None
     tasks = ((source, row, compared) for row in rows)
     for done, (own, count) in enumerate(run_unordered(asset_findings, tasks, jobs), 1):
         findings |= set(own)

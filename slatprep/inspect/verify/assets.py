@@ -55,10 +55,10 @@ def asset_findings(
 
     Sources are compared if `roots` is given.
     """
-    asset_id, findings, compared = source.store.ids[row], list[Finding](), 0
+    asset_id, findings, compared = source.ids[row], list[Finding](), 0
     where, expected = "asset", "an asset that can be read"
     try:
-        asset = source.store.asset(row)
+        asset = source.asset(row)
         findings += list(value_findings(asset)) or lookup_findings(asset)
         sound = not findings
         where, expected = RECORD_ARRAY, "a record for each row"
