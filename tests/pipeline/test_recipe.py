@@ -57,6 +57,8 @@ def test_what_changed_is_said(record):
     other = replace(slat, sha256="f" * 64)
     assert same.difference(record, (grid, other)) == f"sources changed: {slat.role}"
     assert same.difference(record, (grid,)) == f"sources changed: {slat.role}"
+    both = (replace(grid, sha256="e" * 64), other)
+    assert same.difference(record, both) == f"sources changed: {grid.role}, {slat.role}"
     assert replace(same, code="other").difference(record, record.sources) == "code changed"
     newer = replace(same, versions={**record.versions, "numpy": "99.0"})
     was = record.versions["numpy"]
