@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import json
 import subprocess
+import symtable
 import sys
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -51,9 +52,9 @@ def test_what_scripts_import_of_each_other_and_of_the_tests_is_there():
     folders = {"": ROOT / "benchmarks", "support": ROOT / "tests" / "support"}
     names = {
         (package, file.stem): {
-            name.id if isinstance(name, ast.Name) else getattr(name, "name", "")
-            for node in ast.parse(file.read_text()).body
-            for name in ast.walk(node)
+            one.get_name()
+            for one in symtable.symtable(file.read_text(), file.name, "exec").get_symbols()
+            if one.is_assigned() or one.is_imported()
         }
         for package, folder in folders.items()
         for file in folder.glob("*.py")
