@@ -84,19 +84,40 @@ def whole_texts(figure: Figure) -> list[str]:
 # -- the picture ----------------------------------------------------------------
 
 
-def test_the_picture_is_whole_and_the_same_each_time(store, tmp_path):
-    file = tmp_path / "one.PNG"
-    told = run("--asset", "ant", "--store", store, "--picture", file).stdout
-    assert f"picture: {file}" in told
-    image = imread(file, "png")
-    assert image.shape[:2] == (HEIGHT, WIDTH)
-    picture = open_store(store)["ant"].plot()
+def hold_whole(picture: np.ndarray, *columns: int) -> None:
+    """Hold that no part of a picture is blank: each of its rows, each column, what is beside."""
+    width = WIDTH + (len(columns) - 5) * (PANEL + 14)
+    assert picture.shape[:2] == (HEIGHT, width)
+    for top in (142, 456, 770):
+        for left in columns:
+            assert picture[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
+
+
+def test_several_assets_get_a_file_each_and_a_contact_sheet(copy, tmp_path, monkeypatch):
+    read: list[str] = []
+    scenes = scene_of
+    monkeypatch.setattr(
+        "slatprep.inspect.pictures.write.scene_of",
+        lambda asset: read.append(asset.asset_id) or scenes(asset),
+    )
+    folder, again = tmp_path / "pictures", tmp_path / "again"
+    words = ("--worst", "1", "--asset", "cup", "--store", copy, "--picture")
+    told = json.loads(run(*words, folder, "--json").stdout)["assets"]
+    assert len(told) == 2 and told[0]["asset_id"] == "cup"
+    assert sorted(read) == sorted(one["asset_id"] for one in told)  # Once, for the sheet as well.
+    assert {Path(one["picture"]) for one in told} | {folder / "sheet.png"} == set(folder.iterdir())
+    run(*words, again, "--jobs", "2")
+    assert tree(again) == tree(folder)
+    for asset in told:
+        passes = {figure["name"]: figure["passes"] for figure in asset["figures"]}
+        assert passes["confidence"] is True and passes["overlap"] is None
+    sheet = imread(folder / "sheet.png")
+    assert sheet[84:284, 40:240].std() > 0.05 and sheet[84:284, 680:880].std() > 0.05
+    image = imread(folder / "cup.png")
+    hold_whole(image, 48, 362, 676, 990, 1350)
+    picture = open_store(copy)["cup"].plot()
     assert picture.format == "PNG"  # A notebook shows it.
     assert np.array_equal(np.asarray(picture)[..., :3], np.rint(image[..., :3] * 255))
-    # No region is blank: the three rows, each of the four columns, each part beside them.
-    for top in (142, 456, 770):
-        for left in (48, 362, 676, 990, 1350):
-            assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
 
 
 @pytest.mark.usefixtures("sides")
@@ -206,10 +227,7 @@ def test_a_deformation_is_shown_before_and_after_and_as_displacement(deformed_bu
         result = run("--asset", asset.asset_id, "--store", store.path, "--picture", file)
         assert "picture:" in result.stdout, result.output
         image = imread(file)
-        assert image.shape[:2] == (HEIGHT, WIDTH + 2 * (PANEL + 14))
-        for top in (142, 456, 770):
-            for left in (48, 362, 676, 990, 1304, 1618, 1978):
-                assert image[top : top + 300, left : left + 300, :3].std() > 0.05, (top, left)
+        hold_whole(image, 48, 362, 676, 990, 1304, 1618, 1978)
     # The scale under the column goes from the colour of none to that of the largest.
     bar = image[1092, 990:1290, :3]
     end = scene.displacement_scale
@@ -265,21 +283,6 @@ def test_worst_and_ambiguous_choose_by_the_stores_figures(mixed_build, monkeypat
     assert choose_assets(store, worst=5) == by_verdict
 
 
-def test_several_assets_get_a_file_each_and_a_contact_sheet(copy, tmp_path):
-    folder, again = tmp_path / "pictures", tmp_path / "again"
-    words = ("--worst", "1", "--asset", "cup", "--store", copy, "--picture")
-    told = json.loads(run(*words, folder, "--json").stdout)["assets"]
-    assert len(told) == 2 and told[0]["asset_id"] == "cup"
-    assert {Path(one["picture"]) for one in told} | {folder / "sheet.png"} == set(folder.iterdir())
-    run(*words, again, "--jobs", "2")
-    assert tree(again) == tree(folder)
-    for asset in told:
-        passes = {figure["name"]: figure["passes"] for figure in asset["figures"]}
-        assert passes["confidence"] is True and passes["overlap"] is None
-    sheet = imread(folder / "sheet.png")
-    assert sheet[84:284, 40:240].std() > 0.05 and sheet[84:284, 680:880].std() > 0.05
-
-
 def test_one_file_cannot_hold_several_assets_and_none_is_no_failure(copy):
     told = run("--worst", "2", "--store", copy, "--picture", "all.png", code=2).stderr
     assert "need a folder" in told
@@ -316,9 +319,10 @@ def test_without_a_screen_show_says_where_the_picture_is_also_of_a_broken_store(
         pytest.skip("a screen is always taken to be there")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    file = tmp_path / "ant.png"
-    told = run("--asset", "ant", "--store", copy, "--picture", file, "--show").stderr
-    assert "no screen" in told and str(file) in told
+    file = tmp_path / "ant.PNG"
+    told = run("--asset", "ant", "--store", copy, "--picture", file, "--show")
+    assert "no screen" in told.stderr and str(file) in told.stderr
+    assert f"picture: {file}" in told.stdout and imread(file, "png").size
     misplace(copy, 0.4)
     file = copy.with_name("copy.pictures") / "ant.png"
     assert str(file) in run("--asset", "ant", "--store", copy, "--show", code=1).stderr
