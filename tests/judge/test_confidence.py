@@ -108,7 +108,7 @@ def called_good(targets: np.ndarray, decoys: np.ndarray) -> dict[str, np.ndarray
 
 
 @pytest.mark.parametrize("mixed", [0, 20, 80, 160])
-def test_the_stated_rates_are_the_true_ones(mixed: int) -> None:
+def test_the_stated_rates_are_the_true_ones(mixed):
     count = 400
     truly = np.arange(count) < mixed
     targets = np.concatenate([wrong(mixed, 5), right(count - mixed)])
@@ -128,14 +128,14 @@ def test_the_stated_rates_are_the_true_ones(mixed: int) -> None:
     assert np.floor(least) <= (sure & truly).sum() <= np.ceil(most)
 
 
-def test_of_shuffled_pairs_hardly_any_is_kept() -> None:
+def test_of_shuffled_pairs_hardly_any_is_kept():
     found = rated(wrong(300, 7), wrong(200))
     assert found.wrong_share > 0.9
     assert found.kept(0.01)[0] <= 3
     assert found.errors.mean() > 0.9
 
 
-def test_where_decoys_fit_as_well_nothing_can_be_told() -> None:
+def test_where_decoys_fit_as_well_nothing_can_be_told():
     """A dataset of balls: any SLAT is as good as the own one."""
     found = rated(right(200), right(100, 9))
     assert found.wrong_share > 0.8
@@ -144,7 +144,7 @@ def test_where_decoys_fit_as_well_nothing_can_be_told() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 10, LEAST_TARGETS - 1])
-def test_few_assets_are_judged_by_the_shipped_model(count: int) -> None:
+def test_few_assets_are_judged_by_the_shipped_model(count):
     targets = right(count)
     found = rated(targets, wrong(count))
     assert not found.refitted
@@ -152,7 +152,7 @@ def test_few_assets_are_judged_by_the_shipped_model(count: int) -> None:
     assert 0.0 <= found.wrong_share_range[0] <= found.wrong_share_range[1] <= 1.0
 
 
-def test_the_order_of_assets_does_not_matter() -> None:
+def test_the_order_of_assets_does_not_matter():
     targets, decoys = np.concatenate([wrong(40, 3), right(160)]), wrong(100)
     folds = np.arange(len(targets)) % FOLDS
     rest = (np.arange(100) % FOLDS,)
@@ -166,7 +166,7 @@ def test_the_order_of_assets_does_not_matter() -> None:
     assert second.wrong_share == pytest.approx(first.wrong_share)
 
 
-def test_a_dataset_that_the_shipped_model_finds_rough_is_set_right_by_its_decoys() -> None:
+def test_a_dataset_that_the_shipped_model_finds_rough_is_set_right_by_its_decoys():
     """All fit worse than what the model was fitted to, and decoys worse still."""
     targets, decoys = made(200, (0.3, 0.5), 2), made(150, (0.7, 1.0), 3)
     found = rated(targets, decoys)
@@ -222,9 +222,7 @@ def shares_right(likely: list[np.ndarray], right: list[np.ndarray]) -> list[np.f
     return [so[part].mean() for part in np.array_split(order, 4)]
 
 
-def test_labels_are_right_as_often_as_they_are_said_to_be(
-    cases: list[Case], judged: list[Judged]
-) -> None:
+def test_labels_are_right_as_often_as_they_are_said_to_be(cases, judged):
     said, right = [], []
     for (_, _, truth), (judgement, likely, annotation) in zip(cases, judged, strict=True):
         valid = annotation.valid
@@ -240,7 +238,7 @@ def test_labels_are_right_as_often_as_they_are_said_to_be(
     assert shares[0] < shares[-1] and shares[-1] > 0.97
 
 
-def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases: list[Case]) -> None:
+def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases):
     # Of the same objects, as a source without classes has them: the same values, all of class 0.
     said, right = [], []
     for field, latents, truth in cases:
@@ -257,7 +255,7 @@ def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases: l
     assert shares[0] < 0.95 < shares[-1]
 
 
-def test_properties_that_differ_little_are_one_label(of_a_chair: OfAChair) -> None:
+def test_properties_that_differ_little_are_one_label(of_a_chair):
     field, latents, alignment, annotation = of_a_chair
     plain = replace(field, material=np.zeros_like(field.material), classified=False)
     by_value = voxel_confidence(plain, latents, alignment, annotation, 0.9)
@@ -270,9 +268,7 @@ def test_properties_that_differ_little_are_one_label(of_a_chair: OfAChair) -> No
     np.testing.assert_array_equal(voxel_confidence(rough, latents, alignment, near, 0.9), by_value)
 
 
-def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(
-    of_a_chair: OfAChair,
-) -> None:
+def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(of_a_chair):
     field, _, _, annotation = of_a_chair
     rng = np.random.default_rng(0)
     held, changed = [], 0
@@ -295,7 +291,7 @@ def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(
     assert changed
 
 
-def test_own_objects_pass_and_other_objects_fail(cases: list[Case], judged: list[Judged]) -> None:
+def test_own_objects_pass_and_other_objects_fail(cases, judged):
     confidences = [judgement.confidence for judgement, _, _ in judged]
     assert np.median(confidences) > 0.9
     assert sum(judgement.verdict is Verdict.FAILED for judgement, _, _ in judged) <= 1
@@ -312,7 +308,7 @@ def test_own_objects_pass_and_other_objects_fail(cases: list[Case], judged: list
     ("asked", "name"),
     sorted({(asked, figure.name) for asked in MODELS for figure in MODELS[asked].figures}),
 )
-def test_a_better_figure_never_lowers_confidence(asked: str, name: str) -> None:
+def test_a_better_figure_never_lowers_confidence(asked, name):
     model = MODELS[asked]
     assert model.names == FIGURES
     own = [figure for figure in model.figures if figure.name == name]
@@ -325,21 +321,21 @@ def test_a_better_figure_never_lowers_confidence(asked: str, name: str) -> None:
     assert all(before <= after for before, after in pairwise(confidences))
 
 
-def test_each_question_has_figures_of_its_own() -> None:
+def test_each_question_has_figures_of_its_own():
     looked_at = {name: {figure.name for figure in model.figures} for name, model in MODELS.items()}
     assert looked_at["right placement"] <= set(OF_PLACEMENT)
     assert not looked_at["same object"] & set(OF_PLACEMENT)
     assert all(looked_at.values())
 
 
-def test_the_voxels_curve_rises() -> None:
+def test_the_voxels_curve_rises():
     assert VOXEL.names == VOXEL_FIGURES
     odds, shares = np.array(VOXEL.curve).T
     assert (np.diff(odds) > 0).all() and (np.diff(shares) >= 0).all()
     assert shares[0] >= 0 and shares[-1] <= 1
 
 
-def test_a_figure_that_is_not_known_adds_nothing() -> None:
+def test_a_figure_that_is_not_known_adds_nothing():
     values = USUAL.copy()
     known = PLACEMENT.probability(values)
     values[FIGURES.index("margin")] = math.nan
@@ -355,7 +351,7 @@ def of_a_chair() -> OfAChair:
     return field, latents, alignment, annotation
 
 
-def test_any_engine_is_judged_by_the_same_figures(of_a_chair: OfAChair) -> None:
+def test_any_engine_is_judged_by_the_same_figures(of_a_chair):
     field, latents, alignment, annotation = of_a_chair
     around = surroundings_of(field, latents, alignment, annotation)
     own = evidence_of(field, latents, alignment, annotation, around, 0.0)
@@ -365,7 +361,7 @@ def test_any_engine_is_judged_by_the_same_figures(of_a_chair: OfAChair) -> None:
     assert measure_figures(field, latents, bare).score_slat > 0.9
 
 
-def test_doubt_is_where_the_border_is(of_a_chair: OfAChair) -> None:
+def test_doubt_is_where_the_border_is(of_a_chair):
     field, latents, alignment, annotation = of_a_chair
     likely = voxel_confidence(field, latents, alignment, annotation, 0.9)
     height = np.abs(latents.coords[:, 2] - 31.5)
@@ -374,7 +370,7 @@ def test_doubt_is_where_the_border_is(of_a_chair: OfAChair) -> None:
     assert (unsure <= likely).all() and unsure.mean() < likely.mean()
 
 
-def test_a_turned_placement_is_no_longer_sure(of_a_chair: OfAChair) -> None:
+def test_a_turned_placement_is_no_longer_sure(of_a_chair):
     field, latents, alignment, _ = of_a_chair
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     wrong = replace(alignment, transform=half_turn @ alignment.transform, figures=None)
@@ -384,7 +380,7 @@ def test_a_turned_placement_is_no_longer_sure(of_a_chair: OfAChair) -> None:
     assert judgement.confidence < THRESHOLDS.failed_confidence
 
 
-def test_what_takes_confidence_away_is_summed_by_cause_largest_first() -> None:
+def test_what_takes_confidence_away_is_summed_by_cause_largest_first():
     assert all(taken == 0 for taken in causes_of_doubt(USUAL).values())
     bent = USUAL.copy()
     bent[FIGURES.index("bending")] = 1.0

@@ -81,7 +81,7 @@ def figures(alignment: Alignment, ambiguity: float) -> dict[str, float]:
     return dict(zip(FIGURES, found.tolist(), strict=True))
 
 
-def test_each_figure_by_hand() -> None:
+def test_each_figure_by_hand():
     scaled = fitted(make_transform(np.eye(3), scale=0.8), UPSIDE_DOWN, FAR_OFF)
     expected = {
         "score_slat": 0.81, "score_pixieverse": 0.72, "score_similarity": 0.63,
@@ -102,13 +102,13 @@ def test_each_figure_by_hand() -> None:
     assert figures(scaled, 0.3) == pytest.approx(expected)
 
 
-def test_what_was_not_measured_of_the_agreement_is_not_known() -> None:
+def test_what_was_not_measured_of_the_agreement_is_not_known():
     older = replace(fitted(), figures=replace(FIT, agreement=None))
     unknown = [name for name, value in figures(older, 0.0).items() if math.isnan(value)]
     assert unknown == list(FIGURES[-12:])
 
 
-def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose() -> None:
+def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose():
     tied = fitted(None, UPSIDE_DOWN)
     several = figures(tied, HARMLESS + 0.001)
     assert (several["margin"], several["alike"]) == (0.2, 0.0)
@@ -125,7 +125,7 @@ def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose() 
     assert figures(on_ground, 0.0)["ground"] == 1.0
 
 
-def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated() -> None:
+def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated():
     tower = np.zeros((64, 64, 64), dtype=bool)
     tower[20:44, 20:44] = True
     field = field_of(tower, np.where(GRID[..., 2] < 32, 1, 3))
@@ -144,7 +144,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
     assert not around.moved.any() and not around.tied.any()
 
 
-def test_how_far_a_deformation_moves_is_measured_in_the_frame_of_the_annotation() -> None:
+def test_how_far_a_deformation_moves_is_measured_in_the_frame_of_the_annotation():
     field, latents, annotation = column(5)
     pushed = Deformation(np.eye(3, 4), np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)))
     alignment = replace(fitted(make_transform(np.eye(3), scale=0.5)), deformation=pushed)
@@ -175,7 +175,7 @@ def test_ties_count_by_how_many_of_them_change_the_class(most, ties, share, monk
     assert not surroundings_of(field, latents, settled, annotation).tied.any()
 
 
-def test_ties_that_change_few_classes_count_as_one() -> None:
+def test_ties_that_change_few_classes_count_as_one():
     # Of 40 voxels in 20 layers four change by a painted layer, by a half each.
     field, latents, annotation = column(2)
     tied = surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied
@@ -205,8 +205,8 @@ def as_annotation(field: MaterialField, rows: np.ndarray) -> Annotation:
 
 @pytest.mark.parametrize(("properties", "parts"), [(1, 10), (2, 10), (3, 5), (4, 2.5)])
 def test_labels_without_classes_are_the_nearest_tenths_or_coarser_where_these_are_too_many(
-    properties: int, parts: float
-) -> None:
+    properties, parts
+):
     # Eleven tenths to the power of 1, 2 and 3 are 11, 121 and 1331; six fifths are 216 at the
     # third, 1296 at the fourth; and the three steps of 0, 0.4 and 0.8 are 81.
     rng = np.random.default_rng(0)
@@ -221,7 +221,7 @@ def test_labels_without_classes_are_the_nearest_tenths_or_coarser_where_these_ar
     assert own.tolist() == [cells[4], 255, cells[0], cells[77]]
 
 
-def test_labels_are_made_coarser_where_255_are_too_few() -> None:
+def test_labels_are_made_coarser_where_255_are_too_few():
     tenths = np.argwhere(np.ones((11,) * 3, dtype=bool)) / 10
     for count, labels in ((255, 255), (256, None)):
         values = np.concatenate([tenths[: count - 1], tenths[-1:]])
@@ -233,7 +233,7 @@ def test_labels_are_made_coarser_where_255_are_too_few() -> None:
         assert cells.max() < 255
 
 
-def test_no_label_is_that_of_nothing_however_many_combinations_there_are() -> None:
+def test_no_label_is_that_of_nothing_however_many_combinations_there_are():
     # Nine properties that are either 0 or 1 have 512 combinations, however coarse.
     values = np.argwhere(np.ones((2,) * 9, dtype=bool)).astype(float)
     field = plain_field(values)
@@ -244,9 +244,7 @@ def test_no_label_is_that_of_nothing_however_many_combinations_there_are() -> No
 
 @pytest.mark.parametrize("value", [0.05, 0.45])
 @pytest.mark.parametrize("beside", [-0.002, 0.002])
-def test_labels_hold_where_no_value_is_as_near_to_a_border_as_rounding_may_move_it(
-    value: float, beside: float
-) -> None:
+def test_labels_hold_where_no_value_is_as_near_to_a_border_as_rounding_may_move_it(value, beside):
     # Value and ends move by `off` each: value - low by two, and two more through the extent.
     field = plain_field(np.array([[0.0], [1.0], [value + beside]]))
     annotation = as_annotation(field, np.array([2]))
@@ -254,7 +252,7 @@ def test_labels_hold_where_no_value_is_as_near_to_a_border_as_rounding_may_move_
     assert not labels_hold(field, annotation, np.array([0.00051]))
 
 
-def test_borders_of_coarser_labels_count_only_where_these_are_used() -> None:
+def test_borders_of_coarser_labels_count_only_where_these_are_used():
     # 0.1 is a border of fifths, not of tenths.
     few = plain_field(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.1, 0.1, 0.1]]))
     off = np.full(3, 1e-4)
@@ -275,7 +273,7 @@ def ball(radius: float, at: float = 31.5) -> np.ndarray:
     return solid
 
 
-def test_an_engine_without_figures_has_a_larger_ball_s_offset() -> None:
+def test_an_engine_without_figures_has_a_larger_ball_s_offset():
     for larger in (1.0, -1.0):
         field, latents = field_of(ball(18.0 + larger)), surface_latents(ball(18.0))
         found = measure_figures(field, latents, fitted())
@@ -289,7 +287,7 @@ def test_an_engine_without_figures_has_a_larger_ball_s_offset() -> None:
     assert found.within[0] > 0.4 and found.roughness == pytest.approx(1.0, abs=0.2)
 
 
-def test_an_engine_without_figures_has_those_of_a_shifted_ball() -> None:
+def test_an_engine_without_figures_has_those_of_a_shifted_ball():
     """Archimedes: heights on a sphere are even; from each follows how far off the other one is."""
     field, latents = field_of(ball(18.0)), surface_latents(ball(18.0, 35.5))
     found = measure_figures(field, latents, fitted())
@@ -307,7 +305,7 @@ def test_an_engine_without_figures_has_those_of_a_shifted_ball() -> None:
     assert measure_figures(field, latents, fitted(there)).within[0] > 0.98
 
 
-def test_figures_of_a_voxel_by_hand() -> None:
+def test_figures_of_a_voxel_by_hand():
     others = np.array([[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]], np.float32)
     solid = np.array([[0, 0.25, 0, 0], [0, 0.65, 0, 0]], np.float32)
     around = Surroundings(
@@ -338,7 +336,7 @@ def test_figures_of_a_voxel_by_hand() -> None:
     np.testing.assert_allclose(less, whole * [1.0, 0.75], rtol=1e-6)
 
 
-def test_voxels_without_a_counterpart_change_no_other_voxels_confidence() -> None:
+def test_voxels_without_a_counterpart_change_no_other_voxels_confidence():
     one = {name: values[:1] * 0 for name, values in vars(AROUND).items()}
     far = one | {"distance": np.array([40], np.float32), "moved": np.array([9], np.float32)}
     both = Surroundings(
@@ -351,6 +349,6 @@ def test_voxels_without_a_counterpart_change_no_other_voxels_confidence() -> Non
 
 
 @pytest.mark.parametrize("certain", [0.0, 1.0])
-def test_a_probability_of_nought_or_one_leaves_finite_figures(certain: float) -> None:
+def test_a_probability_of_nought_or_one_leaves_finite_figures(certain):
     unsure = voxel_figures(AROUND, certain)[:, VOXEL_FIGURES.index("asset_unsure")]
     np.testing.assert_allclose(unsure, (1 - 2 * certain) * math.log(999), rtol=1e-4)

@@ -42,7 +42,7 @@ def annotation(likely: list[float] | None, unlabelled: int = 0) -> Annotation:
     return annotated(classes, confidence=None if likely is None else confidence)
 
 
-def test_an_asset_on_every_limit_is_good_for_no_reason() -> None:
+def test_an_asset_on_every_limit_is_good_for_no_reason():
     least = THRESHOLDS
     shares = least.good_valid_share, least.good_ambiguity
     given = verdict_of(FINE, *shares, 3, least.good_confidence, 1.0, least.good_accuracy)
@@ -51,14 +51,14 @@ def test_an_asset_on_every_limit_is_good_for_no_reason() -> None:
     assert verdict_of(ROUGH, 1.0, same_object=0.96, right_placement=0.95) == (Verdict.GOOD, ())
 
 
-def test_a_tie_that_something_settled_is_as_good_as_its_probability() -> None:
+def test_a_tie_that_something_settled_is_as_good_as_its_probability():
     settled = verdict_of(FINE, 1.0, 0.4, 0, same_object=0.99, right_placement=0.97)
     assert settled == (Verdict.GOOD, ())
     still_open, _ = verdict_of(FINE, 1.0, 0.4, 1, same_object=0.99, right_placement=0.97)
     assert still_open is Verdict.DOUBTFUL
 
 
-def test_every_reason_is_named_once() -> None:
+def test_every_reason_is_named_once():
     verdict, reasons = verdict_of(ROUGH, 0.7, 0.4, 2, 0.6, 0.8, 0.7, "roughness", contradicted=True)
     assert verdict is Verdict.DOUBTFUL
     assert reasons == (
@@ -79,15 +79,13 @@ def test_every_reason_is_named_once() -> None:
 
 
 @pytest.mark.parametrize(("gain", "good"), [(math.nan, True), (0.025, True), (0.026, False)])
-def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(
-    gain: float, good: bool
-) -> None:
+def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(gain, good):
     verdict, reasons = verdict_of(FINE, 1.0, same_object=0.99, right_placement=1.0, mirrored=gain)
     assert verdict is (Verdict.GOOD if good else Verdict.DOUBTFUL)
     assert len(reasons) == (0 if good else 1)
 
 
-def test_without_a_cause_none_is_named_and_the_fitness_is() -> None:
+def test_without_a_cause_none_is_named_and_the_fitness_is():
     _, (first, *fitnesses) = verdict_of(ROUGH, 1.0, same_object=0.6, right_placement=1.0)
     assert first.endswith("together)")
     assert len(fitnesses) == 2
@@ -109,9 +107,7 @@ def test_without_a_cause_none_is_named_and_the_fitness_is() -> None:
         (0.6, 0.7, Verdict.DOUBTFUL, "perhaps another object"),
     ],
 )
-def test_failed_says_which_of_the_two_questions_failed(
-    same: float, placed: float, verdict: Verdict, first: str
-) -> None:
+def test_failed_says_which_of_the_two_questions_failed(same, placed, verdict, first):
     given, reasons = verdict_of(FINE, 1.0, 0, 0, same, placed, cause="shape")
     assert given is verdict
     assert reasons[0].startswith(first)
@@ -127,14 +123,14 @@ def test_failed_says_which_of_the_two_questions_failed(
         (3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # As labels they are one.
     ],
 )
-def test_a_placement_that_ties_is_not_failed(ties: int, ambiguity: float, verdict: Verdict) -> None:
+def test_a_placement_that_ties_is_not_failed(ties, ambiguity, verdict):
     given, _ = verdict_of(FINE, 1.0, ambiguity, ties, same_object=1.0, right_placement=0.2)
     assert given is verdict
     assert verdict_of(FINE, 1.0, ambiguity, ties, 0.2, 1.0)[0] is Verdict.FAILED
 
 
 @pytest.mark.parametrize("before", Verdict)
-def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(before: Verdict) -> None:
+def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(before):
     after = Verdict.DOUBTFUL if before is Verdict.GOOD else before
     against = contradicted(judgement(before, 0.9))
     assert (against.verdict, against.contradicted) == (after, True)
@@ -154,7 +150,7 @@ def test_contradiction_and_samples_that_differ_make_good_ones_doubtful(before: V
     (0.7, [0.6, 0.6]),  # too little before, which its own reasons tell
     (0.7, [0.8, 0.9]),
 ])  # fmt: skip
-def test_samples_that_agree_add_no_reason(alone: float, likely: list[float]) -> None:
+def test_samples_that_agree_add_no_reason(alone, likely):
     before = judgement(Verdict.GOOD, alone)
     together = merged(before, annotation(likely))
     assert together.expected_accuracy == pytest.approx(np.mean(likely))
@@ -164,12 +160,12 @@ def test_samples_that_agree_add_no_reason(alone: float, likely: list[float]) -> 
 
 
 @pytest.mark.parametrize("likely", [None, []])
-def test_samples_without_any_label_are_right_nowhere(likely: list[float] | None) -> None:
+def test_samples_without_any_label_are_right_nowhere(likely):
     several = merged(judgement(Verdict.GOOD, 0.9), annotation(likely, 2))
     assert (several.verdict, several.expected_accuracy) == (Verdict.DOUBTFUL, 0.0)
 
 
-def test_a_judgement_has_what_was_measured_of_its_asset() -> None:
+def test_a_judgement_has_what_was_measured_of_its_asset():
     """A bar of two classes that fits as well with its ends swapped."""
     solid = np.zeros((64, 64, 64), dtype=bool)
     solid[22:42, 31:33, 31:33] = True
@@ -210,7 +206,7 @@ def _ambiguity(occupancy: np.ndarray, material: np.ndarray | None = None) -> tup
     return alignment, measure_ambiguity(field, latents, alignment, annotation, PARAMETERS)
 
 
-def test_a_ball_of_one_material_is_ambiguous_and_harmless() -> None:
+def test_a_ball_of_one_material_is_ambiguous_and_harmless():
     alignment, ambiguity = _ambiguity(BALL)
     assert len(alignment.placements) == 23  # all other quarter turns
     assert alignment.margin < 1e-6
@@ -218,7 +214,7 @@ def test_a_ball_of_one_material_is_ambiguous_and_harmless() -> None:
     assert ambiguity.property_change == (0.0, 0.0, 0.0)
 
 
-def test_a_ball_with_a_painted_half_is_not_harmless() -> None:
+def test_a_ball_with_a_painted_half_is_not_harmless():
     painted = np.where(GRID[..., 2] < 32, 1, 3)
     _, ambiguity = _ambiguity(BALL, painted)
     # Turned upside down every voxel changes class: E by two decades, density
@@ -227,7 +223,7 @@ def test_a_ball_with_a_painted_half_is_not_harmless() -> None:
     np.testing.assert_allclose(ambiguity.property_change, (2.0, np.log10(2), 0.02), rtol=1e-5)
 
 
-def test_a_box_with_a_painted_end_by_hand() -> None:
+def test_a_box_with_a_painted_end_by_hand():
     # 40 x 20 x 10: the turns that keep it are by 180 degrees about each axis,
     # and two of the three swap the ends.
     box = np.zeros((64, 64, 64), dtype=bool)
@@ -241,7 +237,7 @@ def test_a_box_with_a_painted_end_by_hand() -> None:
     assert ambiguity.material_share == np.float64(expected)
 
 
-def test_a_chair_has_one_placement() -> None:
+def test_a_chair_has_one_placement():
     alignment, ambiguity = _ambiguity(chair(), np.where(GRID[..., 2] < 32, 1, 3))
     assert alignment.placements == ()
     assert ambiguity.material_share == 0.0
@@ -290,7 +286,7 @@ def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(m
     assert looked == [pytest.approx(MOST_VOXELS / FEWER, rel=0.05)]
 
 
-def test_without_classes_a_property_that_changes_notably_counts_by_hand() -> None:
+def test_without_classes_a_property_that_changes_notably_counts_by_hand():
     """log10 E along x is 5, 5.45, 5.5, 6, twice, and 5 aside; half a turn about z swaps x.
 
     So it changes by 1, 0.05, 0.05 and 1 in four layers, of a range of 1, of which a tenth is

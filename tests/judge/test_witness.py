@@ -5,6 +5,7 @@ Latents are heard where they know of classes, and silent where they do not.
 
 from collections import defaultdict
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def a_model(seed: int = 0) -> LatentModel:
     return LatentModel(rng.normal(size=(7, 8)), root @ root.T + np.eye(8), shares)
 
 
-def test_moments_of_an_asset_have_the_weight_of_one_asset() -> None:
+def test_moments_of_an_asset_have_the_weight_of_one_asset():
     rng = np.random.default_rng(0)
     for known in (1, 2, 30):
         feats = rng.normal(size=(known + 3, 8)).astype(np.float32)
@@ -64,7 +65,7 @@ def test_moments_of_an_asset_have_the_weight_of_one_asset() -> None:
     assert not nothing.weight.any() and not nothing.products.any()
 
 
-def test_a_model_has_the_moments_of_the_classes_about_their_means() -> None:
+def test_a_model_has_the_moments_of_the_classes_about_their_means():
     """In two passes over weighted voxels. Some classes have less than one asset's weight in all."""
     rng = np.random.default_rng(1)
     (fold, *others) = range(FOLDS)
@@ -99,7 +100,7 @@ def test_a_model_has_the_moments_of_the_classes_about_their_means() -> None:
     np.testing.assert_allclose(covariance, within + 1e-3 * np.diag(variance), rtol=1e-6, atol=1e-9)
 
 
-def test_two_classes_in_two_folds_are_enough_for_models_and_less_is_not() -> None:
+def test_two_classes_in_two_folds_are_enough_for_models_and_less_is_not():
     rng = np.random.default_rng(2)
     feats = rng.normal(size=(40, 8)).astype(np.float32)
     two, one = np.repeat([1, 4], 20).astype(np.uint8), np.full(40, 4, dtype=np.uint8)
@@ -112,7 +113,7 @@ def test_two_classes_in_two_folds_are_enough_for_models_and_less_is_not() -> Non
     )
 
 
-def test_likelihoods_and_gain_are_those_of_gaussians() -> None:
+def test_likelihoods_and_gain_are_those_of_gaussians():
     model = a_model()
     rng = np.random.default_rng(3)
     feats = rng.normal(size=(50, 8)).astype(np.float32)
@@ -155,9 +156,7 @@ def class_at(field: MaterialField) -> dict[tuple[int, ...], int]:
 
 
 @pytest.mark.parametrize(("classes", "axes"), [("levels", [0, 1]), ("octants", [0, 1, 2])])
-def test_labels_are_compared_with_those_half_a_turn_away_block_by_block(
-    classes: str, axes: list[int]
-) -> None:
+def test_labels_are_compared_with_those_half_a_turn_away_block_by_block(classes, axes):
     """About the box's three axes, the shortest first. A place above the top looks down to it."""
     field, latents, labels = box(classes)
     model, there = a_model(), class_at(field)
@@ -187,7 +186,7 @@ def test_labels_are_compared_with_those_half_a_turn_away_block_by_block(
         np.testing.assert_allclose(np.sort(found), wanted, rtol=1e-9, atol=1e-9)
 
 
-def test_of_placements_the_voxels_count_that_have_a_class_under_all() -> None:
+def test_of_placements_the_voxels_count_that_have_a_class_under_all():
     field, latents, labels = box("octants")
     model, there = a_model(), class_at(field)
     likely = model.log_likelihood(latents.feats)
@@ -211,7 +210,7 @@ def test_of_placements_the_voxels_count_that_have_a_class_under_all() -> None:
     assert found.gain == model.gain(latents.feats, labels)
 
 
-def test_what_has_no_label_or_no_axes_is_not_compared() -> None:
+def test_what_has_no_label_or_no_axes_is_not_compared():
     field, latents, labels = box("octants")
     none = np.full_like(labels, UNANNOTATED)
     parameters, model = SampleParameters(), a_model()
@@ -225,7 +224,7 @@ def test_what_has_no_label_or_no_axes_is_not_compared() -> None:
         assert len(found.against) == turns
 
 
-def test_a_turn_that_changes_few_classes_is_left_out() -> None:
+def test_a_turn_that_changes_few_classes_is_left_out():
     """A stripe of the box has the other class; of a fifth of its voxels, or of few."""
     solid = ((GRID >= LOW) & (GRID < HIGH)).all(axis=-1)
     coords = voxels_of(boundary(solid))
@@ -251,56 +250,47 @@ def compared(*blocks: list[float], gain: float = 1.0) -> LatentEvidence:
     return LatentEvidence(np.zeros(1), np.zeros((1, 1), np.int64), 9, gain, against)
 
 
-def test_the_factor_makes_log_likelihoods_log_odds() -> None:
-    """Platt's target of n that agree is (n + 1) / (n + 2), whose log odds are log(n + 1)."""
-    for gain in (0.25, 2.5):
-        reliability = reliability_of([compared([gain]) for _ in range(20)])
-        assert (reliability.witnesses, reliability.agreeing) == (20, 20)
-        assert reliability.factor == pytest.approx(np.log(21.0) / gain)
+HALF = 0.2 * 11 / 12 + 0.4
+"""Of shares p and 1 - p with log odds f and -f, the slope is 0 where
+sigma(f) = (2 p - 1) target + 1 - p, with Platt's target of n that agree, (n + 1) / (n + 2)."""
+
+AGREES, DIFFERS = compared([0.3, 0.2], [-0.5, 0.6]), compared([5.0], [-0.1])
+
+HEARD = [
+    # All agree, and the log odds of Platt's target are log(n + 1).
+    ([compared([0.25])] * 20, 20, 20, np.log(21.0) / 0.25),
+    ([compared([2.5])] * 20, 20, 20, np.log(21.0) / 2.5),
+    # Blocks disagree; an asset of many of them counts as much as another.
+    ([compared([3.0] * 3 * k + [-3.0] * 2 * k) for k in (1,) * 5 + (7,) * 5], 10, 10,
+     np.log(HALF / (1 - HALF)) / 3.0),
+    # Its labels have to be likelier than those of every turn. Of heads as many were rarer than
+    # one in a thousand: 1 of 1,024 and 17 of 65,536 are, 2 and 137 are not.
+    ([AGREES] * 15 + [DIFFERS, compared()], 16, 15, None),
+    ([AGREES, DIFFERS, compared([1.0, -1.0])], 3, 1, 0.0),
+    ([compared([1.0])] * 10, 10, 10, None),
+    ([compared([1.0])] * 9, 9, 9, 0.0),
+    ([compared([1.0])] * 15 + [compared([-0.1])], 16, 15, None),
+    ([compared([1.0])] * 14 + [compared([-0.1])] * 2, 16, 14, 0.0),
+    # One contradicts more than all agree.
+    ([compared([1.0])] * 30 + [compared([-99.0])], 31, 30, 0.0),
+    ([], 0, 0, 0.0),
+    ([compared()] * 20, 0, 0, 0.0),
+]  # fmt: skip
+"""What assets say, how many are compared and agree, and the factor: None for any above 0."""
 
 
-def test_blocks_that_disagree_make_the_factor_small() -> None:
-    """Of shares p and 1 - p with log odds f and -f, the slope is 0 where
-    sigma(f) = (2 p - 1) target + 1 - p. An asset of many blocks counts as much as another."""
-    evidence = [compared([3.0] * 3 * k + [-3.0] * 2 * k) for k in (1,) * 5 + (7,) * 5]
-    reliability = reliability_of(evidence)
-    assert (reliability.witnesses, reliability.agreeing) == (10, 10)
-    sigma = 0.2 * 11 / 12 + 0.4
-    assert reliability.factor == pytest.approx(np.log(sigma / (1 - sigma)) / 3.0)
+@pytest.mark.parametrize(("evidence", "witnesses", "agreeing", "factor"), HEARD)
+def test_a_factor_makes_log_likelihoods_log_odds_where_witnesses_agree(
+    evidence, witnesses, agreeing, factor
+):
+    found = reliability_of(evidence)
+    assert (found.witnesses, found.agreeing) == (witnesses, agreeing)
+    assert found.factor > 0.0 if factor is None else found.factor == pytest.approx(factor)
+    assert np.isfinite(found.least_gain) == (found.factor > 0.0)
+    assert found.least_gain == -np.inf or found.factor > 0.0
 
 
-def test_an_asset_agrees_if_its_labels_are_likelier_than_those_of_every_turn() -> None:
-    agreeing = [compared([0.3, 0.2], [-0.5, 0.6])]
-    against = [compared([5.0], [-0.1]), compared([1.0, -1.0])]
-    reliability = reliability_of(agreeing * 15 + against[:1] + [compared()])
-    assert (reliability.witnesses, reliability.agreeing) == (16, 15)
-    assert reliability_of(agreeing + against).agreeing == 1
-
-
-@pytest.mark.parametrize(
-    ("agreeing", "others", "used"), [(10, 0, True), (9, 0, False), (15, 1, True), (14, 2, False)]
-)
-def test_latents_are_used_if_so_many_heads_were_rarer_than_one_in_a_thousand(
-    agreeing: int, others: int, used: bool
-) -> None:
-    """1 and 2 of 1,024, 17 and 137 of 65,536."""
-    evidence = [compared([1.0])] * agreeing + [compared([-0.1])] * others
-    reliability = reliability_of(evidence)
-    assert (reliability.factor > 0.0) == used
-    assert np.isfinite(reliability.least_gain) == used
-
-
-def test_one_that_contradicts_more_than_all_agree_makes_latents_worth_nothing() -> None:
-    reliability = reliability_of([compared([1.0])] * 30 + [compared([-99.0])])
-    assert (reliability.factor, reliability.least_gain) == (0.0, -np.inf)
-
-
-def test_without_anything_compared_latents_are_not_used() -> None:
-    for evidence in ([], [compared()] * 20):
-        assert reliability_of(evidence) == Reliability(0, 0, 0.0, -np.inf)
-
-
-def test_the_least_gain_is_that_of_one_asset_in_two_hundred_and_never_positive() -> None:
+def test_the_least_gain_is_that_of_one_asset_in_two_hundred_and_never_positive():
     gains = np.arange(201.0) - 5.0
     evidence = [compared([1.0], gain=gain) for gain in gains]
     assert reliability_of(evidence).least_gain == pytest.approx(-4.0)
@@ -308,75 +298,64 @@ def test_the_least_gain_is_that_of_one_asset_in_two_hundred_and_never_positive()
 
 
 SURE = Reliability(200, 200, 0.5, 0.0)
+JUST = Reliability(18, 18, 0.5, 0.0)
+"""By the rule of succession it is as sure as `DECISIVE`."""
+
+TWO = [[0, 300], [300, 0]]
+SAME, OTHER = 10, 400  # one voxel in a hundred, and more
+LAST_TWO = [[0, OTHER, OTHER], [OTHER, 0, SAME], [OTHER, SAME, 0]]
+FIRST_TWO = [[0, SAME, OTHER], [SAME, 0, OTHER], [OTHER, OTHER, 0]]
+FOUR = [[0, 200, 300, 400], [200, 0, 250, 350], [300, 250, 0, 150], [400, 350, 150, 0]]
 
 
-def tied(support: list[float], differing: list[list[int]], voxels: int = 1000) -> LatentEvidence:
-    return LatentEvidence(np.array(support), np.array(differing), voxels, 1.0, ())
+def odds(*logs: float) -> float:
+    """Return how likely the first is of some log odds, half of the log likelihoods."""
+    return float(np.exp(logs[0]) / np.exp(logs).sum())
 
 
-def test_of_two_placements_the_likelier_is_taken_if_that_is_decisive() -> None:
-    """Ten more in log likelihood, each worth half: log odds of five."""
-    differing = [[0, 300], [300, 0]]
-    chosen = choice_of(tied([-40.0, -30.0], differing), SURE)
-    assert chosen is not None
-    assert chosen[0] == 1
-    choice = chosen[1]
-    assert choice.probability == pytest.approx(1.0 / (1.0 + np.exp(-5.0)))
-    assert (choice.evidence, choice.voxels) == (10.0, 300)
-    assert (choice.witnesses, choice.agreeing) == (200, 200)
-    kept = choice_of(tied([-30.0, -40.0], differing), SURE)
-    assert kept is not None and kept[0] == 0
-    assert kept[1] == choice
+CHOICES = [
+    # Ten more in log likelihood, each worth half: log odds of five.
+    ([-40.0, -30.0], TWO, SURE, (1, odds(5.0, 0.0), 10.0, 300)),
+    ([-30.0, -40.0], TWO, SURE, (0, odds(5.0, 0.0), 10.0, 300)),
     # Log odds of 2.9 are a probability of 0.948, of 3.0 one of 0.953.
-    assert choice_of(tied([0.0, 5.8], differing), SURE) is None
-    assert choice_of(tied([0.0, 6.0], differing), SURE) is not None
-
-
-def test_a_choice_is_no_surer_than_witnesses_are_reliable() -> None:
-    """By the rule of succession: 19 of 20 is 20 / 22, and 37 of 37 is 38 / 39."""
-    differing = [[0, 300], [300, 0]]
-    certain = tied([0.0, 500.0], differing)
-    assert choice_of(certain, Reliability(20, 19, 0.5, 0.0)) is None
-    chosen = choice_of(certain, Reliability(37, 37, 0.5, 0.0))
-    assert chosen is not None
-    assert chosen[1].probability == pytest.approx(38 / 39)
-    just = Reliability(18, 18, 0.5, 0.0)
-    assert (just.agreeing + 1) / (just.witnesses + 2) == DECISIVE
-    assert choice_of(certain, just) is not None
-
-
-def test_placements_of_the_same_labels_share_what_is_likely() -> None:
-    """The last two differ in one voxel in a hundred and count as one; so do the first two."""
-    same, other = 10, 400
-    differing = [[0, other, other], [other, 0, same], [other, same, 0]]
-    chosen = choice_of(tied([0.0, 6.0, 5.5], differing), SURE)
-    assert chosen is not None
-    assert chosen[0] == 1
-    likely = np.exp([3.0, 2.75]).sum()
-    assert chosen[1].probability == pytest.approx(likely / (likely + 1.0))
-    assert chosen[1].evidence == 6.0
+    ([0.0, 5.8], TWO, SURE, None),
+    ([0.0, 6.0], TWO, SURE, (1, odds(3.0, 0.0), 6.0, 300)),
+    # No choice is surer than witnesses are: 19 of 20 is 20 / 22, and 37 of 37 is 38 / 39.
+    ([0.0, 500.0], TWO, Reliability(20, 19, 0.5, 0.0), None),
+    ([0.0, 500.0], TWO, Reliability(37, 37, 0.5, 0.0), (1, 38 / 39, 500.0, 300)),
+    ([0.0, 500.0], TWO, JUST, (1, DECISIVE, 500.0, 300)),
+    # Placements of the same labels share what is likely.
+    ([0.0, 6.0, 5.5], LAST_TWO, SURE, (1, 1 - odds(0.0, 3.0, 2.75), 6.0, OTHER)),
     # The one the asset has stands where it has the labels of the likeliest.
-    differing = [[0, same, other], [same, 0, other], [other, other, 0]]
-    chosen = choice_of(tied([5.0, 6.0, -2.0], differing), SURE)
-    assert chosen is not None
-    assert chosen[0] == 0
-    assert (chosen[1].evidence, chosen[1].voxels) == (8.0, other)
+    ([5.0, 6.0, -2.0], FIRST_TWO, SURE, (0, 1 - odds(-1.0, 2.5, 3.0), 8.0, OTHER)),
+    # The rival is the likeliest of other labels.
+    ([-9.0, -4.0, 5.0, -7.0], FOUR, SURE, (2, odds(2.5, -2.0, -3.5, -4.5), 9.0, 250)),
+    # Latents that are not used, and labels that are the same, choose nothing.
+    ([0.0, 500.0], TWO, Reliability(200, 120, 0.0, -np.inf), None),
+    ([0.0, 500.0], [[0, SAME], [SAME, 0]], SURE, None),
+    ([0.0, 500.0], [[0, 11], [11, 0]], SURE, (1, 201 / 202, 500.0, 11)),
+]
+"""Log likelihoods of placements, in how many of 1,000 voxels they differ, the witnesses, and what
+is chosen: which, with what probability, what in log likelihood and voxels decides it."""
 
 
-def test_the_rival_is_the_likeliest_of_other_labels() -> None:
-    differing = [[0, 200, 300, 400], [200, 0, 250, 350], [300, 250, 0, 150], [400, 350, 150, 0]]
-    chosen = choice_of(tied([-9.0, -4.0, 5.0, -7.0], differing), SURE)
-    assert chosen is not None
-    assert chosen[0] == 2
-    assert (chosen[1].evidence, chosen[1].voxels) == (9.0, 250)
+@pytest.mark.parametrize(("support", "differing", "reliability", "expected"), CHOICES)
+def test_the_likeliest_placement_is_taken_if_that_is_decisive(
+    support, differing, reliability, expected
+):
+    tied = LatentEvidence(np.array(support), np.array(differing), 1000, 1.0, ())
+    chosen = choice_of(tied, reliability)
+    assert (chosen is None) == (expected is None)
+    if chosen is not None:
+        found = chosen[1]
+        told = chosen[0], found.probability, found.evidence, found.voxels
+        assert told == pytest.approx(expected)
+        assert (found.witnesses, found.agreeing) == (reliability.witnesses, reliability.agreeing)
 
 
-def test_latents_that_are_not_used_and_labels_that_are_the_same_choose_nothing() -> None:
-    certain = tied([0.0, 500.0], [[0, 300], [300, 0]])
-    assert choice_of(certain, Reliability(200, 120, 0.0, -np.inf)) is None
-    assert choice_of(tied([0.0, 500.0], [[0, 10], [10, 0]]), SURE) is None  # one in a hundred
-    assert choice_of(tied([0.0, 500.0], [[0, 11], [11, 0]]), SURE) is not None
-    assert choice_of(tied([0.0, 500.0], [[0, 0], [0, 0]], voxels=0), SURE) is None
+def test_nothing_compared_chooses_nothing():
+    nothing = LatentEvidence(np.array([0.0, 500.0]), np.zeros((2, 2), np.int64), 0, 1.0, ())
+    assert choice_of(nothing, SURE) is None
 
 
 CODES = np.linalg.qr(np.random.default_rng(7).normal(size=(8, 8)))[0]
@@ -429,6 +408,7 @@ class Asset:
         )
 
 
+@cache
 def models_of(latents: Latents) -> tuple[list[LatentModel], Reliability]:
     assets = [Asset(number, latents) for number in range(40)]
     models = fit_models((a.object_id, moments_of(a.latents.feats, a.material)) for a in assets)
@@ -439,7 +419,7 @@ def models_of(latents: Latents) -> tuple[list[LatentModel], Reliability]:
 UPSIDE_DOWN = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
 
 
-def test_latents_that_know_classes_choose_the_right_one_of_two_placements() -> None:
+def test_latents_that_know_classes_choose_the_right_one_of_two_placements():
     models, reliability = models_of(telling)
     assert reliability.agreeing == reliability.witnesses == 40
     for number in range(100, 120):
@@ -457,9 +437,7 @@ def test_latents_that_know_classes_choose_the_right_one_of_two_placements() -> N
 
 
 @pytest.mark.parametrize("latents", [noise, shuffled, of_object])
-def test_latents_that_know_nothing_of_places_settle_and_contradict_nothing(
-    latents: Latents,
-) -> None:
+def test_latents_that_know_nothing_of_places_settle_and_contradict_nothing(latents):
     models, reliability = models_of(latents)
     assert reliability.factor == 0.0
     for number in range(100, 110):
@@ -468,7 +446,7 @@ def test_latents_that_know_nothing_of_places_settle_and_contradict_nothing(
         assert not evidence.gain < reliability.least_gain
 
 
-def test_labels_of_another_object_are_contradicted_and_true_ones_are_not() -> None:
+def test_labels_of_another_object_are_contradicted_and_true_ones_are_not():
     models, reliability = models_of(telling)
     for number in range(100, 130):
         asset = Asset(number, telling)
