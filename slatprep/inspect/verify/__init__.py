@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from slatprep.errors import StoreError
+from slatprep.geometry.frames import split_transform
 from slatprep.inspect.verify.assets import asset_findings
 from slatprep.inspect.verify.manifests import manifest_findings, moved, source_roots
 from slatprep.pipeline.rows import SourceStore
@@ -60,8 +61,8 @@ _NUMBERS = {
 }
 """The largest number of a column; the smallest is 0."""
 
-# R of a similarity satisfies R^T R = s^2 I; rounding leaves this much.
 _TOLERANCE = 1e-6
+"""What rounding leaves of the determinant of a rotation, which is 1."""
 
 
 @dataclass(frozen=True)
@@ -239,15 +240,13 @@ def _transform_findings(store: Store) -> Iterator[Finding]:
     for asset_id, model, transform in zip(
         store.ids, store.column("model"), store.column("transform"), strict=True
     ):
-        linear = transform[:3, :3]
         kind = "rigid" if model == "rigid" else "similarity"
-        fine = np.isfinite(transform).all() and (transform[3] == (0, 0, 0, 1)).all()
-        if fine:
-            determinant = float(np.linalg.det(linear))
-            square = abs(determinant) ** (2 / 3)
-            rest = np.abs(linear.T @ linear - square * np.eye(3)).max()
-            fine = determinant > 0 and rest <= _TOLERANCE * max(square, 1.0)
-            fine &= kind != "rigid" or abs(determinant - 1) <= _TOLERANCE
+        try:
+            _, _, scale = split_transform(transform)
+            fine = (transform[3] == (0, 0, 0, 1)).all()
+            fine &= kind != "rigid" or abs(scale**3 - 1) <= _TOLERANCE
+        except ValueError:
+            fine = False
         if not fine:
             yield Finding(
                 "asset/transform",
