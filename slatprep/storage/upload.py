@@ -196,7 +196,8 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     """
     staged = staged or Staged({}, {})
     files, place = local_files(new), staged.version
-    digests = {**{name: file_digest(new / name) for name in files}, **staged.digests}
+    unknown = files.keys() - staged.digests.keys()
+    digests = {**{name: file_digest(new / name) for name in unknown}, **staged.digests}
     sizes, content = {**files, **staged.sizes}, versions.content_of(digests)
     if before.pointer is not None and before.pointer.content == content:
         if place is not None:

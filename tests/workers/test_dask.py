@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -32,14 +33,6 @@ from slatprep.pipeline.dataset import align_pairs, build_store, plan_build
 from slatprep.workers import dask as module
 from slatprep.workers.dask import Cluster
 from slatprep.workers.local import run_unordered
-
-
-@pytest.fixture
-def processes(tmp_path: Path) -> Iterator[Processes]:
-    (tmp_path / "dask").mkdir()
-    started = Processes(tmp_path / "dask")
-    yield started
-    started.stop()
 
 
 @pytest.fixture(scope="module")
@@ -180,16 +173,19 @@ def test_a_worker_that_is_not_fit_is_refused_even_when_it_joins_late(shared, add
             end(unfit)
 
 
-def test_a_worker_with_other_code_is_refused(processes, tmp_path):
+def test_a_worker_with_other_code_is_refused(shared, address, tmp_path):
     copy = tmp_path / "other" / "slatprep"
     shutil.copytree(Path(slatprep.__file__).parent, copy)
     with (copy / "sample.py").open("a") as file:
         file.write("\nOTHER = True\n")
-    address = processes.scheduler()
-    processes.worker(address, "--no-nanny", path=str(copy.parent))
+    other = shared[0].worker(address, path=str(copy.parent))
     expected = r"worker tcp://.* has slatprep's code [0-9a-f]+, where .* expected the same env"
-    with pytest.raises(SlatprepError, match=expected), Cluster(address):
-        pass
+    try:
+        wait_for_workers(address, 4)
+        with pytest.raises(SlatprepError, match=expected), Cluster(address):
+            pass
+    finally:
+        end(other)
 
 
 # -- a scheduler that fails -------------------------------------------------
@@ -210,10 +206,13 @@ def test_a_scheduler_that_nobody_reaches(monkeypatch):
             Cluster(wrong).__enter__()
 
 
-def test_a_scheduler_that_is_killed_ends_the_run_and_nothing_hangs(processes, monkeypatch):
-    scheduler = processes.scheduler()
-    processes.worker(scheduler, "--no-nanny")
-    with Cluster(scheduler) as cluster:
+def test_a_scheduler_that_is_killed_ends_the_run_and_nothing_hangs(tmp_path, monkeypatch):
+    processes = Processes(tmp_path)
+    with ExitStack() as ending:
+        ending.callback(processes.stop)
+        scheduler = processes.scheduler()
+        processes.worker(scheduler, "--no-nanny")
+        cluster = ending.enter_context(Cluster(scheduler))
         # Only now: a loaded machine may need longer for the first answer.
         monkeypatch.setattr(module, "ANSWER_SECONDS", 3)
         results = cluster.run_unordered(time.sleep, ((0.2,) for _ in range(10**6)))

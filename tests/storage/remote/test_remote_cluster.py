@@ -189,13 +189,16 @@ def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
 
 
-def test_a_dry_run_on_a_cluster_finds_what_its_build_would(s3, url, sources, shared, address):
+def test_a_dry_run_on_a_cluster_finds_what_its_build_would(
+    s3, url, undisturbed, sources, shared, address
+):
     kill = shared[0].folder / "kill at asset spooled"
     kill.touch()
     parameters = Dataset(place_of(sources)).parameters("pixie")
     with Cluster(address) as cluster:
         assert build_store(parameters, url, jobs=cluster, keep_work=True).complete
         assert not kill.exists()
+        assert current(s3, url) == tree(undisturbed[1])
         s3.rm(f"{url}/current.json")
         plan = plan_build(parameters, url, jobs=cluster)
         fresh = plan_build(parameters, url, jobs=cluster, fresh=True)
