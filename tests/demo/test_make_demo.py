@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 import tomllib
+from functools import cache
 from typing import get_args
 
 import h5py
@@ -29,6 +30,15 @@ def demo(tmp_path_factory):
     summary = make_demo(root, 5, 7, progress=lambda done, of: seen.append((done, of)))
     assert seen == [(done, 5) for done in range(1, 6)]
     return summary
+
+
+_made_once = cache(make_asset)
+
+
+@pytest.fixture
+def made_once(monkeypatch):
+    """Write the same assets in many forms; each is made for the first."""
+    monkeypatch.setattr("slatprep.demo.make_asset", _made_once)
 
 
 def test_layout_is_that_of_the_real_data(demo):
@@ -89,10 +99,11 @@ def test_same_bytes_again_with_any_number_of_jobs_and_of_assets(demo, tmp_path):
         assert tree(tmp_path / "fewer" / folder).items() <= tree(demo.directory / folder).items()
 
 
+@pytest.mark.usefixtures("made_once")
 @pytest.mark.parametrize("form", ["pixie-predictions", "pixie-prediction-ids"])
 def test_predictions_hold_the_grid_normalised(tmp_path, form):
     make_demo(tmp_path, 1, 7, levels=(2,), source=form)
-    made = make_asset(7, 0, levels=(2,))
+    made = _made_once(7, 0, levels=(2,))
     folder = tmp_path / "pixieverse" / made.object_id
     prediction = np.load(folder / "sample_0_pred.npy")
     assert prediction.dtype == np.float32
@@ -111,9 +122,10 @@ def test_predictions_hold_the_grid_normalised(tmp_path, form):
     assert np.abs(prediction[:3]).max() <= 1.0
 
 
+@pytest.mark.usefixtures("made_once")
 def test_slat_forms_hold_the_same_voxels(tmp_path):
-    view = make_asset(7, 0).views[0]
-    uid = make_asset(7, 0).object_id
+    made = _made_once(7, 0)
+    (view,), uid = made.views, made.object_id
     for form in ("npz-batch", "hdf5", "hdf5-groups"):
         make_demo(tmp_path / form, 2, 7, slat_form=form)
     with np.load(tmp_path / "npz-batch" / "slat" / f"{uid}.npz") as slat:
@@ -192,9 +204,10 @@ def test_a_directory_with_other_content_is_left_alone(tmp_path):
         make_demo(tmp_path / "demo", 1, 1)
 
 
+@pytest.mark.usefixtures("made_once")
 def test_results_are_predictions_that_err(tmp_path):
     make_demo(tmp_path / "demo", 1, 7, levels=(2,), results=True)
-    made = make_asset(7, 0, levels=(2,))
+    made = _made_once(7, 0, levels=(2,))
     prediction = np.load(tmp_path / "demo" / "results" / made.object_id / "sample_0_pred.npy")
     assert prediction.shape == (11, 64, 64, 64) and prediction.dtype == np.float32
     assert (prediction[3:].sum(axis=0) == 1).all()
@@ -239,6 +252,7 @@ def run_printed(output: str, word: str, *more: str) -> str:
     return commands.run(*shlex.split(line.partition(" slatprep ")[2]), *more).output
 
 
+@pytest.mark.usefixtures("made_once")
 @pytest.mark.parametrize("source", get_args(Source))
 def test_two_commands_show_a_source_and_a_third_its_truth(tmp_path, source):
     words = ("--assets", 2, "--level", 0, "--source", source)
@@ -298,6 +312,7 @@ def test_latents_of_every_encoder_are_carried(tmp_path, encoder):
 TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
+@pytest.mark.usefixtures("made_once")
 @pytest.mark.parametrize("source", ["pixieverse", "physxnet"])
 def test_a_wrong_frame_of_any_source_is_caught(tmp_path, source):
     made = make_demo(tmp_path / "demo", 2, 0, levels=(0,), source=source)
