@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zarr
 from support.commands import document, parse_command, refused, run
@@ -115,16 +114,6 @@ def test_entry_holds_libraries_to_one_thread():
 
 
 # -- end to end ---------------------------------------------------------------
-
-
-def test_align_writes_one_record_an_asset(demo):
-    out, sources = demo / "alignments.jsonl", demo / "demo"
-    words = ("--pixieverse", sources / "pixieverse", "--slat", sources / "slat", "--out", out, "-q")
-    assert document("align", *words)["statuses"]["ok"] == 3
-    records = [json.loads(line) for line in out.read_text().splitlines()]
-    assert [record["asset_id"] for record in records] == ids_of(demo / "demo.zarr")
-    stored = zarr.open_group(demo / "demo.zarr", mode="r")["asset/transform"][:]
-    np.testing.assert_array_equal([r["alignment"]["transform"] for r in records], stored)
 
 
 def test_preset_paper_is_asked_of_the_build(demo, monkeypatch):

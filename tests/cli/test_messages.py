@@ -155,8 +155,8 @@ def test_advice_names_the_store_and_not_a_version_that_is_removed_later(
 
 
 def test_quiet_commands_that_make_something_print_nothing(store, tmp_path):
-    made = run("subset", store, "--asset", "cup", "--out", tmp_path / "cup.zarr", "-q")
-    assert made.output == "" and len(open_store(tmp_path / "cup.zarr")) == 1
+    made = run("subset", store, "--asset", "cu", "--out", tmp_path / "cup.zarr", "-q")
+    assert made.output == "" and open_store(tmp_path / "cup.zarr").ids == ["cup"]
     assert run("report", tmp_path / "cup.zarr", "-q").output == ""
     assert "cup" in run("list", tmp_path / "cup.zarr", "-q").stdout
     words = ("export", store, "--format", "npz", "--out", tmp_path / "n", "-q")

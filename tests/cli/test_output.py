@@ -1,4 +1,4 @@
-"""What commands print, and where; commands made of signatures; ids given by their beginning."""
+"""What commands print, and where; commands made of signatures."""
 
 import io
 import json
@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 from support.commands import document, run
 
-from slatprep import StoreError, open_store
+from slatprep import open_store
 from slatprep.cli import output as module
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
@@ -156,21 +156,6 @@ def test_why_is_what_the_record_says(deformed_build):
     for one in list_assets(store):
         assert one.reasons == records.of(one.asset_id).judgement.reasons
         assert (one.verdict == "good") is (one.reasons == ())
-
-
-def test_a_beginning_names_an_asset_where_no_other_has_it(mixed_build):
-    store = open_store(mixed_build.store)
-    assert store.asset("bear.s").asset_id == "bear.side"
-    assert store.asset("d").asset_id == "dog"
-    for name in ("bear.", "b"):
-        with pytest.raises(StoreError, match=r"2 ids begin with .* bear\.front, bear\.side; give"):
-            store.match(name)
-    with pytest.raises(StoreError, match="did you mean dog"):
-        store.find("do")  # What looks one up by its id takes no other.
-    with pytest.raises(StoreError, match="it has 5 assets"):
-        store.match("")
-    words = ("--store", store.path, "--picture", "none", "--asset", "bear.s")
-    assert document("check-alignment", *words)["assets"][0]["asset_id"] == "bear.side"
 
 
 def test_ids_on_a_terminal_are_as_long_as_tells_them_apart(monkeypatch):

@@ -1,5 +1,6 @@
 """No command writes into a store, or over what it reads."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -105,6 +106,8 @@ def test_sources_of_a_dataset_definition_are_not_overwritten(folder):
     assert tree(folder) == before
     for _ in range(2):
         run("align --config @d.toml --out @new.jsonl", folder, code=0)
+    records = (folder / "new.jsonl").read_text().splitlines()
+    assert [json.loads(line)["asset_id"] for line in records] == ["a", "b", "c"]
 
 
 def test_new_files_below_what_is_read_and_beside_a_store_are_written(folder):
