@@ -26,28 +26,12 @@ from slatprep.learn.metrics import (
     OURS,
     average_methods,
     evaluate_store,
-    score_asset,
 )
-from slatprep.learn.predictions import VoxelPrediction
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 from slatprep.learn.splits import assign_store
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters, NormalizeParameters, SampleParameters
 from slatprep.pipeline.dataset import build_store
-
-
-def test_one_asset_by_hand():
-    truth = {
-        "properties": np.array([[0, 0, 0], [1, 1, 1], [np.nan] * 3], np.float32),
-        "material": np.array([2, 2, 255], np.uint8),
-        "valid": np.array([True, True, False]),
-    }
-    predicted = VoxelPrediction(
-        np.array([[0.5, 0, 1], [0.5, 1, 0], [9, 9, 9]]), np.array([2, 3, 4])
-    )
-    score = score_asset(predicted, truth)
-    # E: (0.25 + 0.25) / 2; density: 0; nu: (1 + 1) / 2; their mean; one class of two right.
-    assert score.tolist() == [0.25, 0.0, 1.0, pytest.approx(1.25 / 3), 0.5]
 
 
 def test_objects_count_alike_whatever_their_views():

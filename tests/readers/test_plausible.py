@@ -136,9 +136,8 @@ SWAPPED = {
         *(([swap(*part) for part in RIGHT], f"look like swapped columns.*{words}")
           for words, swap in SWAPPED.items()),
         ([(JELLY, 0.2, -0.3, 0.6), (METAL, 0.9, 0.95, -0.2)], "the values look like normalised"),
-        # There 4 is snow; here it is fluid.
-        ([(4, 1e5, 200, 0.2)], "PhysGaussian's table, where 3 is foam, 4 is snow"),
-        ([(3, 1e5, 40, 0.3)], "PhysGaussian's table"),
+        # There 3 is foam; here it is visplas.
+        ([(3, 1e5, 40, 0.3)], "PhysGaussian's table, where 3 is foam, 4 is snow"),
         ([(JELLY, 2e6, 7850, 0.3)], r"2e\+06 Pa with density 7.85e\+03 kg/m\^3: a metal's"),
     ],
 )  # fmt: skip

@@ -13,7 +13,7 @@ from support.raw_sources import COORDS, FEATS
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents, read_slat
-from slatprep.readers.contents import latent_space, look_standardised, resolve_latents, tell_alone
+from slatprep.readers.contents import latent_space, look_standardised, tell_alone
 from slatprep.readers.slat_files import slat_patterns
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
 
@@ -237,41 +237,6 @@ def test_trellis_2_has_the_moments_that_microsoft_publishes(tmp_path):
         assert (space.mean[0], space.std[0]) == (mean, std)
         folder = f"{'pbr' if 'pbr' in name else 'shape'}_latents/*_{space.resolution * 16}/"
         assert f"{folder}{{id}}.npz" in slat_patterns(source)
-
-
-def test_unpublished_moments_are_those_of_all_voxels_of_the_dataset():
-    rng = np.random.default_rng(1)
-    parts = [rng.normal(size=(n, 4)) * 3 + shift for n, shift in ((100, 5.0), (700, -2.0))]
-    space = resolve_latents(
-        LatentSpace("mine", 4, 64), "auto", [(len(part), moments_of(part)) for part in parts]
-    )
-    every = np.concatenate(parts)
-    assert not space.standardised
-    np.testing.assert_allclose(space.mean, every.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(space.std, every.std(axis=0), rtol=1e-12)
-    standardised = space.standardise(every.astype(np.float32))
-    np.testing.assert_allclose(standardised.mean(axis=0), 0, atol=1e-6)
-    np.testing.assert_allclose(standardised.std(axis=0), 1, atol=1e-6)
-
-
-def test_what_is_standardised_is_not_standardised_again_and_can_be_undone():
-    feats = np.random.default_rng(2).normal(size=(50, 8)).astype(np.float32)
-    done = replace(TRELLIS, standardised=True)
-    np.testing.assert_array_equal(done.standardise(feats), feats)
-    np.testing.assert_allclose(TRELLIS.standardise(done.as_encoded(feats)), feats, atol=1e-6)
-    np.testing.assert_array_equal(TRELLIS.as_encoded(feats), feats)
-
-
-def test_the_reader_wants_the_encoder_s_channels(make_pair):
-    pair = make_pair(
-        coords=np.array([[1, 2, 3], [4, 5, 6]], np.uint8), feats=np.ones((2, 32), np.float32)
-    )
-    with pytest.raises(InputError, match=r"\(2, 32\).*8\).*slat\.encoder: trellis"):
-        read_latents(pair)
-    wide = LatentSpace("trellis2", 32, 64)
-    contents = replace(pair.roots.contents, latents=wide)
-    pair = replace(pair, roots=replace(pair.roots, contents=contents))
-    assert read_latents(pair).feats.shape == (2, 32)
 
 
 @pytest.mark.parametrize(
