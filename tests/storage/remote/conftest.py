@@ -13,6 +13,9 @@ from support import object_store
 from support.remote import Dataset, Made, built
 from support.synthetic import MakeDataset
 
+from slatprep.parameters import BuildParameters
+from slatprep.storage.place import place_of
+
 
 @pytest.fixture(scope="session")
 def server() -> Iterator[str]:
@@ -76,6 +79,13 @@ def another(tmp_path_factory: pytest.TempPathFactory) -> Made:
 @pytest.fixture
 def make_dataset(tmp_path: Path) -> MakeDataset:
     return lambda *ids: Dataset(tmp_path / "sources").having(*ids)
+
+
+@pytest.fixture
+def uploaded(s3: Any, bucket: str, undisturbed: Made) -> BuildParameters:
+    """Put the sources of three assets into the bucket; return the parameters to build them."""
+    s3.put(f"{undisturbed[0].root}/", f"{bucket}/data/", recursive=True)
+    return Dataset(place_of(f"s3://{bucket}/data")).parameters("pixie")
 
 
 class Requests:

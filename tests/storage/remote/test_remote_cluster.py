@@ -10,7 +10,7 @@ import pytest
 from s3fs.core import S3FileSystem
 from support.dask_processes import Processes, end, wait_for_workers, wait_until
 from support.faults import environment as with_fault
-from support.remote import Dataset, Made, current, put, raising, versions
+from support.remote import current, put, raising, versions
 from support.trees import contents, tree
 
 from slatprep.errors import SlatprepError, StoreError
@@ -42,12 +42,6 @@ def address(shared: tuple[Processes, str]) -> str:
     return shared[1]
 
 
-@pytest.fixture
-def sources(s3: Any, bucket: str, undisturbed: Made) -> str:
-    s3.put(f"{undisturbed[0].root}/", f"{bucket}/data/", recursive=True)
-    return f"s3://{bucket}/data"
-
-
 def left_behind(s3: Any, url: str) -> set[str]:
     """Return what lies below a store besides the version that is current and the one before."""
     pointer = read_pointer(place_of(url))
@@ -60,12 +54,13 @@ def left_behind(s3: Any, url: str) -> set[str]:
 
 
 def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_one_machine(
-    s3, url, sources, undisturbed, another, shared, address, tmp_path
+    s3, url, uploaded, undisturbed, another, shared, address, tmp_path
 ):
     faults = shared[0].folder
     put(another[1], url)
     (tmp_path / "dataset.toml").write_text(
-        f'[pixieverse]\nroot = "{sources}/pixieverse"\n[slat]\nroot = "{sources}/slat"\n'
+        f'[pixieverse]\nroot = "{uploaded.pixieverse.root}"\n'
+        f'[slat]\nroot = "{uploaded.slat.root}"\n'
         '[normalize]\nranges = "pixie"\n[store]\nvoxel_chunk = 512\nvoxel_chunks_per_shard = 4\n'
         "grid_assets_per_shard = 2\ncompression_level = 1\n"
     )
@@ -113,7 +108,7 @@ def spooled(s3: Any, url: str) -> list[str]:
 
 
 def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
-    url, sources, shared, address, tmp_path_factory
+    url, uploaded, shared, address, tmp_path_factory
 ):
     lost = shared[0].worker_elsewhere(
         address, tmp_path_factory.getbasetemp(), AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY=""
@@ -122,7 +117,7 @@ def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
         wait_for_workers(address, 4)
         told = rf"worker tcp://.*: sees nothing it may read .*credentials.* {url}/spool/builder"
         with Cluster(address) as cluster, pytest.raises(SlatprepError, match=told):
-            build_store(Dataset(place_of(sources)).parameters("pixie"), url, jobs=cluster)
+            build_store(uploaded, url, jobs=cluster)
     finally:
         end(lost)
 
@@ -190,17 +185,16 @@ def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
 
 
 def test_a_dry_run_on_a_cluster_finds_what_its_build_would(
-    s3, url, undisturbed, sources, shared, address
+    s3, url, undisturbed, uploaded, shared, address
 ):
     kill = shared[0].folder / "kill at asset spooled"
     kill.touch()
-    parameters = Dataset(place_of(sources)).parameters("pixie")
     with Cluster(address) as cluster:
-        assert build_store(parameters, url, jobs=cluster, keep_work=True).complete
+        assert build_store(uploaded, url, jobs=cluster, keep_work=True).complete
         assert not kill.exists()
         assert current(s3, url) == tree(undisturbed[1])
         s3.rm(f"{url}/current.json")
-        plan = plan_build(parameters, url, jobs=cluster)
-        fresh = plan_build(parameters, url, jobs=cluster, fresh=True)
+        plan = plan_build(uploaded, url, jobs=cluster)
+        fresh = plan_build(uploaded, url, jobs=cluster, fresh=True)
     assert plan.actions["resume"] == 3
     assert fresh.actions["align"] == 3

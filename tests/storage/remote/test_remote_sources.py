@@ -2,31 +2,17 @@
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import h5py
 import pytest
 from support.faults import inject
-from support.remote import Made
 
 from slatprep.errors import ConfigError
-from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.parameters import SlatSource
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.readers import discover
 from slatprep.store import open_store
-
-
-@pytest.fixture
-def uploaded(s3: Any, bucket: str, undisturbed: Made) -> BuildParameters:
-    """Put the sources of three assets into the bucket; return the parameters to build them."""
-    dataset, _ = undisturbed
-    s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
-    return replace(
-        dataset.parameters("pixie"),
-        pixieverse=PixieverseSource(f"s3://{bucket}/data/pixieverse"),
-        slat=SlatSource(f"s3://{bucket}/data/slat"),
-    )
 
 
 def test_each_place_is_listed_once_and_each_file_fetched_once(uploaded, tmp_path, requests):

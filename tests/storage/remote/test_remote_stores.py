@@ -17,7 +17,7 @@ from s3fs.core import S3FileSystem
 from support.commands import refused
 from support.faults import inject
 from support.faulty_proxy import Faults, faulty
-from support.remote import Dataset, current, put, raising, versions
+from support.remote import current, put, raising, versions
 from support.trees import contents, tree
 
 from slatprep.errors import StoreError
@@ -32,12 +32,10 @@ from slatprep.store import Store, open_store
 
 
 def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
-    s3, bucket, url, undisturbed, tmp_path
+    s3, url, uploaded, undisturbed, tmp_path
 ):
-    dataset, expected = undisturbed
-    s3.put(f"{dataset.root}/", f"{bucket}/data/", recursive=True)
-    parameters = Dataset(place_of(f"s3://{bucket}/data")).parameters("pixie")
-    summary = build_store(parameters, url, jobs=2)
+    expected = undisturbed[1]
+    summary = build_store(uploaded, url, jobs=2)
     assert summary.complete
     assert str(summary.store) == url
     assert current(s3, url) == tree(expected)
