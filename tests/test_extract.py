@@ -1,18 +1,18 @@
 """Extraction in both files, against an object with the interface of TRELLIS's pipeline."""
 
 import ast
-import contextlib
 import hashlib
 import json
 import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from support import commands
 from support.synthetic import make_asset
@@ -26,56 +26,18 @@ from slatprep.readers import discover, read_latents
 MEAN, STD = [0.5] * 8, [2.0] * 8
 
 
-class Tensor:
-    """As much of a torch tensor as latents are read by."""
-
-    def __init__(self, values: np.ndarray) -> None:
-        self.values = values
-
-    def detach(self) -> "Tensor":
-        return self
-
-    cpu = float = detach
-
-    def numpy(self) -> np.ndarray:
-        return self.values
-
-
-class Torch(ModuleType):
-    """Seeds, and knows whether gradients are off."""
-
-    def __init__(self) -> None:
-        super().__init__("torch")
-        self.__version__ = "2.0"
-        self.rng, self.gradients = np.random.default_rng(), True
-        self.cuda = SimpleNamespace(is_available=lambda: self.gpu, synchronize=lambda: None)
-        self.gpu = True
-
-    def manual_seed(self, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
-
-    @contextlib.contextmanager
-    def no_grad(self) -> Any:
-        self.gradients = False
-        yield
-        self.gradients = True
-
-    def device(self, name: str) -> str:
-        return f"device {name}"
-
-
 class Pipeline:
     """TRELLIS's interface; the object in the image is an L of `voxels` voxels."""
 
     device = "cpu"
+    sparse_structure_sampler_params: ClassVar = {"steps": 12, "cfg_strength": 7.5}
+    slat_sampler_params: ClassVar = {"steps": 12, "cfg_strength": 3.0, "cfg_interval": [0.5, 1.0]}
+    slat_normalization: ClassVar = {"mean": MEAN, "std": STD}
 
-    def __init__(self, torch: Torch, voxels: int | None = None) -> None:
-        self.torch, self.voxels, self.seen = torch, voxels, []
-        self.sparse_structure_sampler_params = {"steps": 12, "cfg_strength": 7.5}
-        self.slat_sampler_params = {"steps": 12, "cfg_strength": 3.0, "cfg_interval": [0.5, 1.0]}
-        self.slat_normalization = {"mean": MEAN, "std": STD}
+    def __init__(self, voxels: int | None = None) -> None:
+        self.voxels, self.seen = voxels, []
 
-    def to(self, device: str) -> None:
+    def to(self, device: torch.device) -> None:
         self.device = device
 
     def preprocess_image(self, input: Image.Image) -> Image.Image:
@@ -83,30 +45,33 @@ class Pipeline:
         return input.resize((518, 518))
 
     def get_cond(self, image: list[Image.Image]) -> dict[str, Any]:
-        assert not self.torch.gradients
+        assert not torch.is_grad_enabled()
         self.seen.append(image[0].size)
-        self.torch.rng.normal(size=3)  # what is drawn before the seed is set must not matter
+        torch.rand(3)  # what is drawn before the seed is set must not matter
         return {"cond": float(np.asarray(image[0]).mean()), "neg_cond": 0.0}
 
     def sample_sparse_structure(
         self, cond: dict, num_samples: int = 1, sampler_params: dict | None = None
-    ) -> np.ndarray:
-        assert num_samples == 1 and not sampler_params and not self.torch.gradients
-        coords = make_asset(0).coords[: self.voxels]
-        return np.insert(self.torch.rng.permutation(coords).astype(np.int64), 0, 0, axis=1)
+    ) -> torch.Tensor:
+        assert num_samples == 1 and not sampler_params and not torch.is_grad_enabled()
+        coords = torch.from_numpy(make_asset(0).coords[: self.voxels].astype(np.int64))
+        return torch.nn.functional.pad(coords[torch.randperm(len(coords))], (1, 0))
 
     def sample_slat(
-        self, cond: dict, coords: np.ndarray, sampler_params: dict | None = None
+        self, cond: dict, coords: torch.Tensor, sampler_params: dict | None = None
     ) -> Any:
-        drawn = self.torch.rng.normal(size=(len(coords), 8)) + cond["cond"]
-        feats = drawn * STD + MEAN
-        return SimpleNamespace(coords=Tensor(coords), feats=Tensor(feats))
+        drawn = torch.randn(len(coords), 8) + cond["cond"]
+        return SimpleNamespace(coords=coords, feats=drawn * torch.tensor(STD) + torch.tensor(MEAN))
 
 
 @pytest.fixture
 def session() -> work.Session:
-    torch = Torch()
-    return work.Session(Pipeline(torch), torch, {"name": "m", "revision": "abc"})
+    return work.Session(Pipeline(), torch, {"name": "m", "revision": "abc"})
+
+
+def has_gpu(monkeypatch: pytest.MonkeyPatch, has: bool) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: has)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
 
 
 @pytest.fixture
@@ -127,14 +92,13 @@ def test_latents_and_their_record_are_what_the_pipeline_returns(session, images,
         coords, feats = saved["coords"], saved["feats"]
     assert (coords.dtype, feats.dtype) == (np.int32, np.float32)
     # What a person who calls the pipeline by hand after seeding it would get.
-    torch = Torch()
-    pipeline = Pipeline(torch)
+    pipeline = Pipeline()
     with torch.no_grad():
         cond = pipeline.get_cond([pipeline.preprocess_image(Image.open(images[0]))])
         torch.manual_seed(7)
         slat = pipeline.sample_slat(cond, pipeline.sample_sparse_structure(cond))
     np.testing.assert_array_equal(coords, slat.coords.numpy())
-    np.testing.assert_array_equal(feats, slat.feats.numpy().astype(np.float32))
+    np.testing.assert_array_equal(feats, slat.feats.numpy())
     assert result.voxels == len(coords) and session.pipeline.seen == ["cropped", (518, 518)]
     # And how to do it again.
     record = json.loads((tmp_path / "slat" / "cup.json").read_text("utf-8"))
@@ -201,13 +165,12 @@ class Full(Pipeline):
 def test_a_bad_image_does_not_stop_the_others(kind, said, images, tmp_path, capsys):
     if kind is Pipeline:
         images[0].write_bytes(b"no image")
-    torch = Torch()
-    bad, good = run(work.Session(kind(torch), torch, {}), images, tmp_path / "slat", 0)
+    bad, good = run(work.Session(kind(), torch, {}), images, tmp_path / "slat", 0)
     assert isinstance(bad, InputError) and f"cup.png: {said}" in str(bad) and good.voxels > 0
     assert [path.name for path in (tmp_path / "slat").glob("*.npz")] == ["bear.npz"]
     printed = capsys.readouterr()
     assert printed.out == "" and ("[ATTENTION]" in printed.err) == (kind is Strict)
-    empty = work.Session(Pipeline(torch, voxels=0), torch, {})
+    empty = work.Session(Pipeline(voxels=0), torch, {})
     [nothing] = run(empty, images[1:], tmp_path / "none", 0)
     assert isinstance(nothing, InputError) and not (tmp_path / "none" / "bear.npz").exists()
 
@@ -226,9 +189,8 @@ def test_without_trellis_the_command_says_what_to_install(command, images, tmp_p
 
 @pytest.mark.parametrize("gpu", [True, False])
 def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatch):
-    torch, commit = Torch(), "0123abcd"
-    torch.gpu = gpu
-    pipeline, asked = Pipeline(torch), []
+    has_gpu(monkeypatch, gpu)
+    commit, pipeline, asked = "0123abcd", Pipeline(), []
 
     def snapshot_download(name: str, revision: str | None) -> str:
         asked.append((name, revision))
@@ -241,7 +203,6 @@ def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatc
 
     loader = SimpleNamespace(from_pretrained=from_pretrained)
     fakes = {
-        "torch": torch,
         "trellis": ModuleType("trellis"),
         "trellis.pipelines": SimpleNamespace(TrellisImageTo3DPipeline=loader),
         "huggingface_hub": SimpleNamespace(snapshot_download=snapshot_download),
@@ -256,7 +217,7 @@ def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatc
     # What TRELLIS prints never comes between the lines of the document.
     device = "cuda" if gpu else "cpu"
     assert "[SPARSE]" in result.stderr and f"TRELLIS runs on {device}" in result.stderr
-    assert pipeline.device == f"device {device}" and "cropped" not in pipeline.seen
+    assert pipeline.device == torch.device(device) and "cropped" not in pipeline.seen
 
 
 SOURCE = Path(trellis_latents.__file__)
@@ -285,16 +246,9 @@ def test_it_runs_where_slatprep_lies_and_with_what_lies_where_it_is_run(tmp_path
     assert "RuntimeError: TRELLIS of here" in ran.stderr
 
 
-@pytest.fixture
-def torch(monkeypatch: pytest.MonkeyPatch) -> Torch:
-    torch = Torch()
-    monkeypatch.setitem(sys.modules, "torch", torch)
-    return torch
+def test_it_writes_what_extract_slat_writes_and_build_store_reads(images, tmp_path, monkeypatch):
+    has_gpu(monkeypatch, True)
 
-
-def test_it_writes_what_extract_slat_writes_and_build_store_reads(
-    images, torch, tmp_path, monkeypatch
-):
     class Printing(Pipeline):
         def preprocess_image(self, input: Any) -> Any:
             print("[SPARSE] Backend: spconv")
@@ -302,7 +256,7 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(
                 raise ValueError("zero-size array to reduction operation minimum")
             return super().preprocess_image(input)
 
-    pipeline = Printing(torch)
+    pipeline = Printing()
     module = SimpleNamespace(
         TrellisImageTo3DPipeline=SimpleNamespace(from_pretrained=lambda name: pipeline)
     )
@@ -312,8 +266,8 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(
     assert trellis_latents.main(words) == 1  # The cup has no foreground; the bear is done.
     made = sorted(path.name for path in (tmp_path / "slat").iterdir())
     assert made == ["bear.json", "bear.npz"]
-    assert pipeline.device == "device cuda"
-    session = extract.Session(Pipeline(torch), torch, {})
+    assert pipeline.device == torch.device("cuda")
+    session = extract.Session(Pipeline(), torch, {})
     list(extract.extract(session, extract.list_extractions(images[1:], tmp_path / "b", [7], False)))
     with np.load(tmp_path / "slat" / "bear.npz") as one, np.load(tmp_path / "b/bear.npz") as two:
         for name in ("coords", "feats"):
@@ -330,18 +284,16 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(
 
 
 @pytest.mark.parametrize(("kind", "side"), [("512", 32), ("1024", 64)])
-def test_trellis2_is_called_in_the_order_of_its_run(kind, side, images, torch):
+def test_trellis2_is_called_in_the_order_of_its_run(kind, side, images, monkeypatch):
     """As `Trellis2ImageTo3DPipeline.run`: preprocess, seed, conditions, voxels, shape latents."""
-    coords, image = Tensor(np.zeros((5, 4), np.int64)), Image.open(images[0])
+    coords, image = torch.zeros((5, 4), dtype=torch.int64), Image.open(images[0])
     flows = {f"shape_slat_flow_model_{name}": f"f{name}" for name in ("512", "1024")}
     run = Mock(device="cpu", models=flows)
     run.preprocess_image.side_effect = lambda image: image
     run.get_cond.side_effect = lambda image, resolution: resolution
     run.sample_sparse_structure.return_value = coords
-    run.sample_shape_slat.return_value = SimpleNamespace(
-        coords=coords, feats=Tensor(np.ones((5, 32)))
-    )
-    torch.manual_seed = run.seed
+    run.sample_shape_slat.return_value = SimpleNamespace(coords=coords, feats=torch.ones(5, 32))
+    monkeypatch.setattr(torch, "manual_seed", run.seed)
     found, feats, seconds = trellis_latents.sample_trellis2(run, torch, image, 3, True, kind)
     assert run.mock_calls == [
         call.preprocess_image(image),
@@ -354,8 +306,9 @@ def test_trellis2_is_called_in_the_order_of_its_run(kind, side, images, torch):
     assert set(seconds) == set(trellis_latents.STAGES)
 
 
-def test_latents_of_sam3d_are_what_it_hands_to_its_decoder(images, torch):
-    slat = SimpleNamespace(coords=Tensor(np.ones((4, 4))), feats=Tensor(np.full((4, 8), 2.0)))
+def test_latents_of_sam3d_are_what_it_hands_to_its_decoder(images):
+    feats = torch.full((4, 8), 2.0, dtype=torch.bfloat16)  # which numpy does not have
+    slat = SimpleNamespace(coords=torch.ones(4, 4), feats=feats)
     decoded: list[Any] = []
 
     class Sam3D:
