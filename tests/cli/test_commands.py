@@ -1,4 +1,4 @@
-"""The commands as a user calls them: help, exit codes, JSON, errors."""
+"""The commands as a user calls them: help, exit codes, JSON, errors, output that is lost."""
 
 import json
 import os
@@ -10,13 +10,14 @@ import time
 from pathlib import Path
 
 import pytest
-import zarr
 from support.commands import document, parse_command, refused, run
 from support.trees import tree
 
 from slatprep.cli.commands import COMMANDS
 from slatprep.errors import ConfigError
+from slatprep.inspect.verify import verify_store
 from slatprep.parameters import PRESETS, BuildParameters
+from slatprep.store import open_store
 
 THREE_ASSETS = ("--assets", "3", "--seed", "3", "--level", "0")
 
@@ -29,10 +30,6 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = folder / "demo" / "dataset.toml"
     run("build-store", "--config", config, "--out", folder / "demo.zarr", "-q")
     return folder
-
-
-def ids_of(store: Path) -> list[str]:
-    return [str(asset_id) for asset_id in zarr.open_group(store, mode="r")["asset/id"][:]]
 
 
 # -- help ---------------------------------------------------------------------
@@ -151,12 +148,12 @@ def test_asset_that_cannot_go_in_is_named_and_exit_code_is_one(demo, tmp_path):
     assert told["ok"] is False
     (line,) = [line for line in result.stderr.splitlines() if line]
     assert line.startswith(f"{broken.stem}: ") and broken.name in line and "expected" in line
-    assert broken.stem not in ids_of(tmp_path / "demo.zarr")
+    assert broken.stem not in open_store(tmp_path / "demo.zarr").ids
 
     strict = run(*arguments, "--strict", code=1)
     assert broken.name in json.loads(strict.stdout).pop("error")
     assert "slatprep: error: " in strict.stderr and broken.name in strict.stderr
-    assert len(ids_of(tmp_path / "demo.zarr")) == 2  # the store that was there is still there
+    assert len(open_store(tmp_path / "demo.zarr")) == 2  # the store that was there is still there
 
     scored = document("score", tmp_path / "demo.zarr", tmp_path / "demo" / "truth", code=1)
     assert scored["missing"] == [broken.stem]
@@ -197,3 +194,52 @@ def test_stopped_build_leaves_the_older_store_and_nothing_else(demo, tmp_path):
     assert "stopped; nothing was replaced" in said and "Traceback" not in said
     assert list(tmp_path.iterdir()) == [store]
     assert tree(store) == before
+
+
+# -- standard output or standard error is closed, or full ---------------------------
+
+
+def shell(words: str, redirected: str) -> subprocess.CompletedProcess[str]:
+    line = f"{sys.executable} -m slatprep {words} {redirected}"
+    return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=600)
+
+
+@pytest.mark.parametrize(
+    ("words", "redirected"),
+    [("info {}", ">&-"), ("list {} --json", "> /dev/full")],
+)
+def test_lost_output_is_told_on_standard_error(mixed_build, words, redirected):
+    if "full" in redirected and not Path("/dev/full").exists():
+        pytest.skip("no /dev/full")
+    done = shell(words.format(mixed_build.store), redirected)
+    assert done.returncode == 3
+    told = [line for line in done.stderr.splitlines() if line.startswith("slatprep: error:")]
+    assert len(told) == 1 and "standard output cannot be written to" in told[0]
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+@pytest.mark.parametrize("redirected", ["2> /dev/full", ">&- 2>&-"])
+def test_a_subset_is_whole_whatever_happens_to_what_it_prints(mixed_build, tmp_path, redirected):
+    out = tmp_path / "s.zarr"
+    done = shell(f"subset {mixed_build.store} --verdict good --out {out}", redirected)
+    assert "Traceback" not in done.stdout + done.stderr
+    assert done.returncode in (0, 3)
+    store = open_store(out)
+    assert len(store) and all(asset.columns["verdict"] == "good" for asset in store)
+    assert verify_store(out).ok
+
+
+def test_lost_notes_are_told_on_standard_output_and_never_within_json(mixed_build, tmp_path):
+    store = mixed_build.store
+    done = shell(f"describe {store}", "2>&-")  # It notes what is not stated.
+    assert done.returncode == 3
+    assert "standard error cannot be written to" in done.stdout
+    # It notes how many objects are in each split.
+    done = shell(f"export {store} --format npz --out {tmp_path}/n --split train --json", "2>&-")
+    assert done.returncode == 3
+    assert json.loads(done.stdout)["command"] == "export"
+
+
+def test_a_reader_that_has_read_enough_is_no_fault(mixed_build):
+    done = shell(f"list {mixed_build.store} --ids", "| head -1")
+    assert done.stdout.count(os.linesep) == 1 and "rror" not in done.stderr
