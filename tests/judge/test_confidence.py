@@ -12,10 +12,9 @@ from support.shapes import GRID, chair, field_of, surface_latents
 from slatprep.align import align
 from slatprep.align.figures import measure_figures
 from slatprep.demo import make_demo
-from slatprep.geometry.deformation import map_of
 from slatprep.inspect.score import Truth, read_truth
 from slatprep.inspect.verify.assets import roundings
-from slatprep.judge import THRESHOLDS, judge, voxel_confidence
+from slatprep.judge import THRESHOLDS, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import causes_of_doubt
 from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
@@ -41,6 +40,7 @@ from slatprep.parameters import (
     SampleParameters,
     SlatSource,
 )
+from slatprep.pipeline.annotate import look_up
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.records import (
     Alignment,
@@ -175,7 +175,7 @@ def test_a_dataset_that_the_shipped_model_finds_rough_is_set_right_by_its_decoys
     assert found.wrong_share < 0.05
 
 
-Judged = tuple[Judgement, np.ndarray, Annotation]
+Judged = tuple[Judgement, Annotation, Alignment]
 OfAChair = tuple[MaterialField, StructuredLatents, Alignment, Annotation]
 
 SPEAK_FOR = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2",
@@ -187,12 +187,13 @@ SPEAK_FOR = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "
 MODELS = {"same object": SAME_OBJECT, "right placement": PLACEMENT}
 
 
-def _judged(field: MaterialField, latents: StructuredLatents) -> Judged:
-    alignment = align(field, latents, AlignParameters())
-    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-    judgement, _ = judge(field, latents, alignment, annotation, SampleParameters())
-    likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
-    return judgement, likely, annotation
+def _judged(
+    field: MaterialField, latents: StructuredLatents, alignment: Alignment | None = None
+) -> Judged:
+    if alignment is None:
+        alignment = align(field, latents, AlignParameters())
+    annotation, judgement = look_up(field, latents, alignment, SampleParameters())
+    return judgement, annotation, alignment
 
 
 @pytest.fixture(scope="module")
@@ -224,8 +225,8 @@ def shares_right(likely: list[np.ndarray], right: list[np.ndarray]) -> list[np.f
 
 def test_labels_are_right_as_often_as_they_are_said_to_be(cases, judged):
     said, right = [], []
-    for (_, _, truth), (judgement, likely, annotation) in zip(cases, judged, strict=True):
-        valid = annotation.valid
+    for (_, _, truth), (judgement, annotation, _) in zip(cases, judged, strict=True):
+        valid, likely = annotation.valid, annotation.confidence
         # One coin decides about all voxels of an asset whose ties differ in class.
         if judgement.ambiguity.material_share == 0:
             said.append(likely[valid])
@@ -238,17 +239,17 @@ def test_labels_are_right_as_often_as_they_are_said_to_be(cases, judged):
     assert shares[0] < shares[-1] and shares[-1] > 0.97
 
 
-def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases):
+def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases, judged):
     # Of the same objects, as a source without classes has them: the same values, all of class 0.
     said, right = [], []
-    for field, latents, truth in cases:
+    for (field, latents, truth), (*_, alignment) in zip(cases, judged, strict=True):
         plain = replace(field, material=np.zeros_like(field.material), classified=False)
-        judgement, own, annotation = _judged(plain, latents)
+        judgement, annotation, _ = _judged(plain, latents, alignment)
         if judgement.ambiguity.material_share > 0:
             continue
         with np.load(truth.path) as file:
             same = np.isclose(annotation.properties, file["properties"], rtol=0.01).all(axis=1)
-        said.append(own[annotation.valid])
+        said.append(annotation.confidence[annotation.valid])
         right.append(same[annotation.valid])
         assert judgement.expected_accuracy == pytest.approx(said[-1].mean(), abs=1e-6)
     shares = shares_right(said, right)
@@ -346,8 +347,7 @@ def test_a_figure_that_is_not_known_adds_nothing():
 def of_a_chair() -> OfAChair:
     solid = chair()
     field, latents = field_of(solid, np.where(GRID[..., 2] < 32, 1, 3)), surface_latents(solid)
-    alignment = align(field, latents, AlignParameters())
-    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
+    _, annotation, alignment = _judged(field, latents)
     return field, latents, alignment, annotation
 
 
@@ -374,8 +374,7 @@ def test_a_turned_placement_is_no_longer_sure(of_a_chair):
     field, latents, alignment, _ = of_a_chair
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     wrong = replace(alignment, transform=half_turn @ alignment.transform, figures=None)
-    annotation = sample(field, map_of(wrong).places(latents.coords), SampleParameters())
-    judgement, _ = judge(field, latents, wrong, annotation, SampleParameters())
+    judgement, _, _ = _judged(field, latents, wrong)
     assert judgement.verdict is Verdict.FAILED
     assert judgement.confidence < THRESHOLDS.failed_confidence
 
