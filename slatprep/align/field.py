@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from slatprep.align.deform import CLEAN, Deformed
 from slatprep.align.figures import measure_figures
-from slatprep.align.finish import finish, rank_of
+from slatprep.align.finish import as_free, finish, rank_of
 from slatprep.align.ground import LEAST_ABOVE, LEAST_GAIN, RAISED, find_layers, gain, raised
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE_SAMPLES, COARSE_TAUS, MOST_SURVIVORS, TIE, Pair
@@ -37,6 +37,7 @@ from slatprep.align.quality import compare
 from slatprep.align.search import ranked, search_all
 from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.align.surface import surface_of
+from slatprep.align.warp import Warp
 from slatprep.geometry.voxels import above, occupancy_of
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
@@ -59,9 +60,6 @@ HOPELESS = 0.1
 
 WIDER_GAIN = 0.02
 """By so much a placement far from the quarter turns must score above the best near them."""
-
-WORSE = 0.02
-"""What scores by so much less once a layer is left out is not followed further."""
 
 CLOSE = 0.02
 """Deformed placements tie if they score less than this below the best, as scores tell more then."""
@@ -90,29 +88,20 @@ def align(
 
 
 def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignment:
-    """Return the best of the alignments without a flat layer, if it is clearly better."""
-
-    def without(ground: Ground) -> Alignment:
+    """Return the alignment without a flat layer that fits best, if it is clearly better."""
+    best, most = found, LEAST_GAIN
+    for ground in (raised(layer, by) for layer in find_layers(pair.pixie) for by in RAISED):
         solid = above(field.occupancy, ground)
         if np.count_nonzero(solid) < LEAST_ABOVE * np.count_nonzero(field.occupancy):
-            return found
+            continue
         there = Pair(pair.slat, surface_of(solid), pair.parameters)
         candidates = _search(there)
-        if candidates.poses[0].score < found.score - WORSE:
-            return found
-        return replace(_alignment(there, candidates), ground=ground)
-
-    def gains(alignment: Alignment) -> float:
-        return gain(alignment, found)
-
-    first, *further = RAISED
-    tried = [without(raised(layer, first)) for layer in find_layers(pair.pixie)]
-    best = max(tried, key=gains, default=found)
-    if best.ground is None or gains(best) < -LEAST_GAIN:
-        return found
-    tried = [without(raised(best.ground, by - first)) for by in further]
-    best = max([best, *tried], key=gains)
-    return best if gains(best) > 0.0 else found
+        if candidates.poses[0].score < found.score:
+            continue
+        without = replace(_alignment(there, candidates), ground=ground)
+        if (rise := gain(without, found)) > most:
+            best, most = without, rise
+    return best
 
 
 def _search(pair: Pair) -> Candidates:
@@ -205,10 +194,11 @@ def fitted_near(
     ]
     poses = pair.polish(pair.refine(starts, COARSE_SAMPLES, COARSE_TAUS, 0.02))
     (best, *_), deformed = finish(pair, poses[:1], rough=poses[0].score < CLEAN)
-    figures = alignment.figures or measure_figures(field, latents, alignment)
-    before = rank_of(Similarity.of(alignment.transform), figures)
-    placement = Placement(best.similarity.transform, best.score, 0.0)
-    return placement, rank_of(best.similarity, deformed.figures) - before
+    own, figures = Similarity.of(alignment.transform), alignment.figures
+    figures = figures or measure_figures(field, latents, alignment)
+    fit = Deformed(own, alignment.model, alignment.deformation, figures, Warp.unbent(own))
+    before, after = (rank_of(free.pose, free.figures) for free in as_free(pair, [fit, deformed]))
+    return Placement(best.similarity.transform, best.score, 0.0), after - before
 
 
 def _figures(pair: Pair, best: Pose, deformed: Deformed, clear_by: float = nan) -> FitFigures:

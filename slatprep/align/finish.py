@@ -59,7 +59,7 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
         return [best, *_told_apart(pair, deformed, near, fits), *far], deformed
     few, rest = others[: MOST_CONTESTED - 1], others[MOST_CONTESTED - 1 :]
     contested = [(best, deformed), *(_deformed(pair, pose, rough) for pose in few)]
-    alike = _as_free(pair, [bent for _, bent in contested])
+    alike = as_free(pair, [bent for _, bent in contested])
     ranks = np.array([rank_of(fit.pose, fit.figures) for fit in alike])
     standing = RANK_STANDING * (np.arange(len(ranks)) == 0)
     order = np.argsort(-(ranks + standing), kind="stable")
@@ -76,7 +76,7 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     return [best, *_told_apart(pair, free, near, fits), *rest], deformed
 
 
-def _as_free(pair: Pair, fits: Sequence[Deformed]) -> list[Deformed]:
+def as_free(pair: Pair, fits: Sequence[Deformed]) -> list[Deformed]:
     """Return fits with the freedom that the freest of them has earned.
 
     What may bend fits better anywhere, so two placements are held against each other alike.

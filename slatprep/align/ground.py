@@ -24,6 +24,9 @@ voxels of the solid from which its top is taken."""
 ENDS, END = 3, 6.0
 """So many ends of the annotation are looked at: those with most samples within so many voxels."""
 
+SAME = 0.999
+"""Layers whose normals have such a cosine, and whose tops lie within half a voxel, are one."""
+
 BLOBS = 0.02
 """Share of the samples that may lie below the ground."""
 
@@ -39,13 +42,12 @@ LEAST_FACE = 0.04
 LEAST_ABOVE = 0.05
 """This share of the voxels lies above ground at least: less is a board's lid, and not an object."""
 
-RAISED = (1.0, 0.0, 2.0)
-"""Voxels above a layer's top at which it is cut off; the first for each layer, the others for the
-best. An object stands in its ground, and that is rough."""
+RAISED = (0.0, 1.0, 2.0)
+"""Voxels above a layer's top at which it is cut off: an object stands in its ground, and that is
+rough."""
 
-LEAST_GAIN, MOST_LOST = 0.05, 0.08
-"""A layer is ground if without it the scores of search and fit rise by so much together, and
-that of the SLAT's samples falls by less than so much, as it would were the layer the object's."""
+LEAST_GAIN = 0.05
+"""A layer is ground if without it the score rises by so much."""
 
 
 def find_layers(surface: Surface) -> list[Ground]:
@@ -63,8 +65,11 @@ def find_layers(surface: Surface) -> list[Ground]:
     inside = np.stack(np.unravel_index(solid, surface.distance.shape), axis=1) + surface.origin
     least = 0.5 * LEAST_FACE * len(surface.points) * len(solid) / total
     found = [_layer(points, inside, end) for end in _ends(points)]
-    wide = sorted((layer for layer in found if layer[2] > least), key=lambda layer: -layer[2])
-    return [_rounded(normal, top * VOXEL_SIZE) for normal, top, _ in wide]
+    kept: list[tuple[Array, float, float]] = []
+    for normal, top, wide in sorted(found, key=lambda layer: -layer[2]):
+        if wide > least and all(normal @ n < SAME or abs(top - t) > 0.5 for n, t, _ in kept):
+            kept.append((normal, top, wide))
+    return [_rounded(normal, top * VOXEL_SIZE) for normal, top, _ in kept]
 
 
 def raised(layer: Ground, voxels: float) -> Ground:
@@ -73,16 +78,19 @@ def raised(layer: Ground, voxels: float) -> Ground:
 
 
 def gain(without: Alignment, found: Alignment) -> float:
-    """Return by how much more than `LEAST_GAIN` a SLAT fits better without a layer.
+    """Return by how much the score of unused samples rises without a layer.
 
-    Minus infinity where the layer is part of the object, or too little is left to tell.
+    What may bend fits nearly anything to a slab. So two fits are compared before any deformation;
+    and as they are, if that says more, where both may bend alike.
     """
     here, there = without.figures, found.figures
     if here is None or there is None:
         return -np.inf
-    slat = here.score_slat - there.score_slat
-    both = 0.5 * (slat + here.score_pixieverse - there.score_pixieverse)
-    return without.score - found.score + both - LEAST_GAIN if slat > -MOST_LOST else -np.inf
+    rise = here.score_similarity - there.score_similarity
+    if without.model is not found.model:
+        return rise
+    slat, pixie = here.score_slat - there.score_slat, here.score_pixieverse - there.score_pixieverse
+    return max(rise, 0.5 * (slat + pixie))
 
 
 def _rounded(normal: Array, height: float) -> Ground:

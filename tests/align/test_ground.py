@@ -11,14 +11,14 @@ from support.shapes import GRID, chair, field_of, judged, surface_latents
 
 from slatprep.align import align
 from slatprep.align import field as engine
-from slatprep.align.ground import find_layers
+from slatprep.align.ground import find_layers, gain
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
 from slatprep.geometry.frames import displacement, make_transform
 from slatprep.judge import THRESHOLDS
 from slatprep.parameters import AlignParameters
-from slatprep.records import LatentChoice, Placement, Verdict
+from slatprep.records import LatentChoice, Model, Placement, Verdict
 
 DEFAULT = AlignParameters()
 HEIGHTS = GRID[..., 2].astype(float)
@@ -99,6 +99,31 @@ def test_a_rug_that_lies_in_the_ground_is_placed(thick, sunk, below, radius, wit
     assert displacement(found.transform, true, latents.centres) < within
 
 
+@pytest.mark.parametrize(("scale", "mark"), [(1.3, 3), (1.3, 5), (1.5, 3)])
+def test_a_rug_on_a_disc_of_about_its_size_is_placed(scale, mark):
+    """Of the heights at which the ground may end only one leaves a rug."""
+    x, y, z = np.moveaxis(GRID, -1, 0)
+    rug = (abs(x - 31.5) < 16) & (abs(y - 31.5) < 12) & (z >= FOOT) & (z < FOOT + 3)
+    rug |= (np.hypot(x - 36, y - 34) < mark) & (z >= FOOT) & (z < FOOT + 5)
+    disc = (z >= FOOT - 4) & (z < FOOT + 1) & (np.hypot(x - 31.5, y - 31.5) < 20)
+    latents = surface_latents(larger(rug, scale))
+    found = align(field_of(rug | disc), latents, DEFAULT)
+    true = make_transform(np.eye(3), scale=scale)
+    assert displacement(found.transform, true, latents.centres) < 0.5
+
+
+def test_what_may_bend_is_not_held_against_what_may_not():
+    stiff = align(field_of(chair()), surface_latents(chair()), DEFAULT)
+    low = replace(stiff.figures, score_similarity=0.6, score_slat=0.9, score_pixieverse=0.8)
+    bent = replace(stiff, model=Model.DEFORMABLE, figures=low)
+    high = replace(low, score_similarity=0.7, score_slat=0.8, score_pixieverse=0.7)
+    assert gain(replace(stiff, figures=high), bent) == pytest.approx(0.1)
+    assert gain(replace(bent, figures=high), bent) == pytest.approx(0.1)
+    higher = replace(low, score_slat=1.0, score_pixieverse=1.0)
+    assert gain(replace(bent, figures=higher), bent) == pytest.approx(0.15)
+    assert gain(replace(stiff, figures=higher), bent) == 0.0
+
+
 def test_a_flat_part_that_both_sides_have_is_no_ground():
     """Where the SLAT shows the layer too, it is the object's, however badly the rest fits."""
     solid = chair() | slab(3.0)
@@ -155,7 +180,7 @@ def test_a_placement_that_is_taken_is_fitted_without_the_ground():
 LIMIT = THRESHOLDS.good_mirrored
 
 
-def gain(solid: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+def mirrored_gain(solid: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
     found = align(field_of(solid), surface_latents(other), DEFAULT)
     return found.figures.mirrored
 
@@ -195,25 +220,25 @@ def test_the_surface_of_a_mirrored_set_is_the_mirrored_surface(axis):
 def test_a_mirrored_annotation_is_told_in_any_rotation(seed):
     solid, mirrored = bitten(chair(), (30, 24, 28)), chair()[::-1]
     other = mirrored if seed is None else turned(mirrored, seed)
-    assert gain(solid, other) > 2 * LIMIT
+    assert mirrored_gain(solid, other) > 2 * LIMIT
 
 
 @pytest.mark.parametrize("seed", [None, 0, 1])
 def test_an_annotation_that_is_not_mirrored_is_not_told_to_be(seed):
     solid, other = bitten(chair(), (30, 24, 28)), chair()
-    found = gain(solid, other if seed is None else turned(other, seed))
+    found = mirrored_gain(solid, other if seed is None else turned(other, seed))
     assert not found > 0.0
 
 
 def test_an_object_that_is_its_own_mirror_image_is_not_told_to_be_mirrored():
     """Bites on both sides, so that neither fits so well that no mirror is tried."""
     for at in ((14, 20, 43), (50, 40, 43)):
-        found = gain(bitten(table(), at), table()[:, :, ::-1])
+        found = mirrored_gain(bitten(table(), at), table()[:, :, ::-1])
         assert abs(found) < LIMIT
 
 
 def test_what_fits_too_well_is_not_tried():
-    assert np.isnan(gain(chair(), chair()))
+    assert np.isnan(mirrored_gain(chair(), chair()))
 
 
 def test_a_mirrored_annotation_is_not_good_and_is_told_as_what_it_is():
