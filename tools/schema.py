@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from typing import Annotated, Any
 
@@ -26,5 +27,6 @@ def json_schemas() -> dict[str, dict[str, Any]]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     for name, schema in json_schemas().items():
         (FOLDER / name).write_text(json.dumps(schema, indent=2) + "\n", encoding="utf-8")

@@ -99,7 +99,8 @@ def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignme
         if candidates.poses[0].score < found.score:
             continue
         without = replace(_alignment(there, candidates), ground=ground)
-        if (rise := gain(without, found)) > most:
+        # What came out ahead of the search may fall behind when it is finished.
+        if without.score >= found.score and (rise := gain(without, found)) > most:
             best, most = without, rise
     return best
 
@@ -196,6 +197,7 @@ def fitted_near(
     (best, *_), deformed = finish(pair, poses[:1], rough=poses[0].score < CLEAN)
     own, figures = Similarity.of(alignment.transform), alignment.figures
     figures = figures or measure_figures(field, latents, alignment)
+    # Figures and model alone are compared; the warp is not known any more.
     fit = Deformed(own, alignment.model, alignment.deformation, figures, Warp.unbent(own))
     before, after = (rank_of(free.pose, free.figures) for free in as_free(pair, [fit, deformed]))
     return Placement(best.similarity.transform, best.score, 0.0), after - before

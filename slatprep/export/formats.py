@@ -175,9 +175,9 @@ class Writer:
     is_export: Callable[[Path], bool] | None = None
 
 
-def one_by_one(write: Callable[[Path, StoredAsset], Exported], **more: Any) -> Writer:
+def one_by_one(write: Callable[[Path, StoredAsset], Exported]) -> Writer:
     """Return the writer of a file for each asset, which `write` puts into a folder."""
-    return Writer(partial(_write_each, write), **more)
+    return Writer(partial(_write_each, write))
 
 
 def _write_each(

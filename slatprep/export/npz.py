@@ -14,6 +14,7 @@ import csv
 import io
 import tarfile
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -52,7 +53,8 @@ def trellis(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
         raise ConfigError(
             f"latent_model is {model!r}; expected an encoder's name, of letters, digits, . _ and -"
         )
-    return one_by_one(partial(write_latents, model), finish=partial(write_metadata, model))
+    each = one_by_one(partial(write_latents, model))
+    return replace(each, finish=partial(write_metadata, model))
 
 
 def write_latents(model: str, directory: Path, asset: StoredAsset) -> Exported:

@@ -7,6 +7,7 @@ of PhysGaussian loads (``load_point_cloud``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of a PLY for each asset; see `slatprep.export.FORMATS`."""
     bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
     one = partial(write, options.points or "slat", options.frame, bounds)
-    return one_by_one(one, remarks=lambda _entries: notes)
+    return replace(one_by_one(one), remarks=lambda _entries: notes)
 
 
 def write(

@@ -9,6 +9,7 @@ usd-core is needed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -55,7 +56,7 @@ def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> 
     _pxr("Usd")
     one = partial(write, options.points or "grid", options.size, options.materials)
     finish = partial(write_scene, options.size)
-    return formats.one_by_one(one, finish=finish, remarks=_remarks)
+    return replace(formats.one_by_one(one), finish=finish, remarks=_remarks)
 
 
 def write(

@@ -100,7 +100,7 @@ class SlatSource(_Group):
     HDF5 file, or a pattern names no ``{id}``, the file has a group for each asset, named by
     `group`.
 
-    `encoder` made the latents: a name of `slatprep.readers.adapters.LATENTS`, or the path of a JSON
+    `encoder` made the latents: a name of `slatprep.records.encoders.LATENTS`, or the path of a JSON
     file that describes another. `standardised` says whether they are standardised already; with
     ``auto``, their values decide.
     """

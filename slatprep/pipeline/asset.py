@@ -53,7 +53,7 @@ from slatprep.records import (
 from slatprep.sample import sample
 from slatprep.storage.faults import reached
 from slatprep.storage.states import noting
-from slatprep.store.record import AssetRecord, FailedRecord, NotIn
+from slatprep.store.record import AssetRecord, FailedRecord, StatusOfFailed
 from slatprep.store.record_json import faults_of
 
 _REASON, _TRACEBACK = 4_000, 100_000
@@ -128,7 +128,7 @@ def _repeated(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> 
     except StoreError:
         return None
     asset = process_asset(pair, context.parameters, known)
-    same = _key(asset, context.recipe) == planned.key and context.previous.gives(asset)
+    same = _key(asset, context.recipe) == planned.key and context.previous.has_labels_of(asset)
     return asset if same else None
 
 
@@ -150,7 +150,7 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
     return found and replace(found[1], seen=planned.seen)
 
 
-def _why(error: Exception) -> tuple[str, str, NotIn]:
+def _why(error: Exception) -> tuple[str, str, StatusOfFailed]:
     """Say why an asset cannot go in, in one line, where slatprep itself is at fault, and how."""
     line, trace = " ".join(str(error).split()), ""
     if len(line) > _REASON:

@@ -305,7 +305,7 @@ def _publish(
     `records` are the shards of records that were taken over; None where nothing was written.
     """
     place, previous = before.place, before.previous
-    there = previous.path if previous and records is None else None
+    there = None if previous is None or records is not None else previous.path
     store, parameters = open_store(place.in_place(there)), before.wanted.parameters
     rows, warnings = new.rows if new else (), list[str]()
     if before.unnoticed:

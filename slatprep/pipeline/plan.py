@@ -168,7 +168,7 @@ def plan_assets(
     done before, none are, unless it is to be said `ahead` which cannot be read.
     """
     resumable = context.spool.holds_any()
-    if not (ahead or resumable or context.previous):
+    if not (ahead or resumable or context.previous is not None):
         return {pair.asset_id: PlannedAsset(pair.asset_id, Action.ALIGN, "new") for pair in pairs}
     plan = {}
     other = []
@@ -184,7 +184,9 @@ def plan_assets(
         plan[planned.asset_id] = planned
         if crew.progress:
             crew.progress(len(plan), len(pairs))
-    gone = set(context.previous.ids if context.previous else ()) - {one.asset_id for one in pairs}
+    gone = set(() if context.previous is None else context.previous.ids) - {
+        one.asset_id for one in pairs
+    }
     why = "no longer among the sources"
     plan |= {asset_id: PlannedAsset(asset_id, Action.REMOVE, why) for asset_id in gone}
     return dict(sorted(plan.items()))
@@ -216,7 +218,7 @@ def _planned(
         names = names_of(pair, sources, found[0])
         return planned(Action.RESUME, "finished by an earlier build", names=names)
     try:
-        record = context.previous.record(asset_id) if context.previous else None
+        record = None if context.previous is None else context.previous.record(asset_id)
     except StoreError as error:
         fault = error.faults[0] if isinstance(error, RecordError) else error
         return planned(Action.ALIGN, f"its record cannot be read: {fault}")

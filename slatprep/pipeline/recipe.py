@@ -41,8 +41,8 @@ from slatprep.store.record import (
     MAX_WARNINGS,
     AssetRecord,
     FailedRecord,
-    NotIn,
     StageParameters,
+    StatusOfFailed,
     VoxelCounts,
 )
 
@@ -213,7 +213,7 @@ def record_of_failed(
     recipe: Recipe,
     reason: str,
     traceback: str = "",
-    status: NotIn = Status.FAILED,
+    status: StatusOfFailed = Status.FAILED,
 ) -> FailedRecord:
     """Return the record of an asset that cannot go in, and why; `traceback` is of our own fault."""
     said = _said_of(pair, recipe)

@@ -89,7 +89,7 @@ class SourceStore(Store):
         """Return the record of a row as the store holds it, JSON in UTF-8."""
         return self.records.text(row).encode()
 
-    def gives(self, asset: Finished) -> bool:
+    def has_labels_of(self, asset: Finished) -> bool:
         """Whether the store's labels and places of an asset are those it has been given now.
 
         Where a pass over the whole dataset chose another alignment, the rows are of that one,

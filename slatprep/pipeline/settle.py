@@ -45,7 +45,7 @@ def settle_rows(
     if not rows:
         raise StoreError(nothing_usable(failed, parameters, before.pairs))
     stores: tuple[SourceStore, ...] = ()
-    if before.previous and not all(row.spooled for row in rows):
+    if before.previous is not None and not all(row.spooled for row in rows):
         stores = (before.previous,)
         ranges = before.previous.normalization
     else:

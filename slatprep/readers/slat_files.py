@@ -133,6 +133,8 @@ def slat_patterns(source: SlatSource) -> tuple[str, ...]:
     if space is None:
         own: tuple[str, ...] = getattr(latent_adapter(source.encoder), "patterns", ())
         return own or usual
+    if not space.encoder.startswith("trellis2"):
+        return usual
     # The folder into which TRELLIS.2's toolkit puts latents of this kind and fineness.
     kind = "pbr" if space.encoder.startswith("trellis2-pbr") else "shape"
     folder = f"{kind}_latents/*_{16 * space.resolution}/"

@@ -196,7 +196,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     """
     staged = staged or Staged({}, {})
     files, place = local_files(new), staged.version
-    unknown = files.keys() - staged.digests.keys()
+    unknown = sorted(files.keys() - staged.digests.keys())
     digests = {**{name: file_digest(new / name) for name in unknown}, **staged.digests}
     sizes, content = {**files, **staged.sizes}, versions.content_of(digests)
     if before.pointer is not None and before.pointer.content == content:

@@ -169,7 +169,7 @@ class AssetRecord:
         )
 
 
-NotIn = Literal[Status.FAILED, Status.SKIPPED]
+StatusOfFailed = Literal[Status.FAILED, Status.SKIPPED]
 """Status of an asset that is not in the store."""
 
 
@@ -189,7 +189,7 @@ class FailedRecord:
     """Image or seed the SLAT was made from; empty where there is one only."""
     category: str
     """PixieVerse category; empty where unknown."""
-    status: NotIn
+    status: StatusOfFailed
     """``skipped`` where a partner is missing, ``failed`` otherwise."""
     reason: Annotated[str, MinLen(1)]
     """Why the asset did not go in, in one line."""

@@ -313,7 +313,7 @@ TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 @pytest.mark.usefixtures("made_once")
-@pytest.mark.parametrize("source", ["pixieverse", "physxnet"])
+@pytest.mark.parametrize("source", ["pixieverse", "physxnet", "voxels-npz"])
 def test_a_wrong_frame_of_any_source_is_caught(tmp_path, source):
     made = make_demo(tmp_path / "demo", 2, 0, levels=(0,), source=source)
     text = made.config.read_text()

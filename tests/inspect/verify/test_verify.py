@@ -140,6 +140,9 @@ OUT_OF_THE_CONTRACT: list[list[tuple[str, Any, object, str]]] = [
     [
         ("asset/transform", (0, 1, 1), np.nan, "is no similarity transform"),
         ("asset/transform", (1, 0, 3), np.inf, "is no similarity transform"),
+        ("asset/transform", (2,), np.diag([-1.0, 1.0, 1.0, 1.0]), "is no similarity transform"),
+        ("asset/transform", (3,), np.eye(4) + np.eye(4, k=1), "is no similarity transform"),
+        ("asset/transform", (4,), np.diag([2.0, 2.0, 2.0, 1.0]), "is no rigid transform"),
         ("asset/fitness", (0,), 1.5, "is 1.5"),
         ("asset/verdict", (0,), "fine", "'fine'"),
         ("asset/engine", (0,), "other", "'other'"),
@@ -161,7 +164,8 @@ OUT_OF_THE_CONTRACT: list[list[tuple[str, Any, object, str]]] = [
 @pytest.mark.parametrize("faults", OUT_OF_THE_CONTRACT)
 def test_values_out_of_the_contract_are_found(store, faults):
     starts = open_store(store).offsets.tolist()
-    rewrite(store, "asset/model", slice(0, 2), "similarity")
+    rewrite(store, "asset/model", slice(0, 4), "similarity")
+    rewrite(store, "asset/model", 4, "rigid")
     for array, (asset, *rest), value, _ in faults:
         voxel = array.startswith("voxel/")
         at = (starts[asset] + rest[0], *rest[1:]) if voxel else (asset, *rest)
