@@ -43,7 +43,7 @@ GROUPS = {
     "Learn": {
         "train": "slatprep.cli.learn:train",
         "predict": "slatprep.cli.learn:predict",
-        "evaluate": "slatprep.cli.learn:evaluate",
+        "evaluate": "slatprep.cli.evaluate:evaluate",
     },
     "Maintain": {
         "verify": "slatprep.cli.verify:verify",

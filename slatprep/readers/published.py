@@ -15,7 +15,8 @@ from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import source_adapter
 from slatprep.readers.patterns import fill, held_names
 from slatprep.records import AssetPair, Place
-from slatprep.storage.archives import ArchivePlace, ArchiveTree, fetch, is_archive, shown
+from slatprep.storage.archives import is_archive, shown
+from slatprep.storage.members import ArchivePlace, ArchiveTree, fetch
 from slatprep.storage.place import storage_of
 
 GRIDS, ARCHIVES = "render_outputs", "archives"

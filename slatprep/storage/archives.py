@@ -1,36 +1,33 @@
 """Archives read as the folder that they were made of, without unpacking them.
 
-An `ArchivePlace` is a file of the tree that several of them make up. Of an uncompressed archive
-only headers are read, and the members that are asked for; where they lie is kept in the cache for
-as long as the archive is the same. Of one with gzip, and of any on an object store, members are
+A `members.ArchivePlace` is a file of the tree that several of them make up. Of an uncompressed
+archive only headers are read, and the members that are asked for; where they lie is kept in the
+cache for as long as the archive is the same. Of one with gzip, and of any on an object store, members are
 kept as well: they come from there but once.
 """
 
 from __future__ import annotations
 
-import errno
-import io
 import os
 import re
 import shutil
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import orjson
 
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import InputError
 from slatprep.storage.atomic import staged_apart
 from slatprep.storage.cache import cache_folder, short
-from slatprep.storage.files import LocalFile, RemoteListing, open_digest, open_regular
-from slatprep.storage.remote import PlaceByText, RemoteFile, RemotePlace, stamp_of
-from slatprep.storage.states import Noted, boot_id, lasting_state
-from slatprep.storage.tar import BLOCK, MAX_KEPT, ArchiveError, Entry, ReadAhead, entries, unpack
+from slatprep.storage.files import LocalFile, open_digest, open_regular
+from slatprep.storage.remote import RemoteFile, RemotePlace, stamp_of
+from slatprep.storage.states import boot_id, lasting_state
+from slatprep.storage.tar import BLOCK, ArchiveError, Entry, ReadAhead, entries, unpack
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -39,9 +36,6 @@ SUFFIXES = (".tar", ".tar.gz", ".tgz")
 """How the names of archives end."""
 
 _FORMAT, _INDEX = 3, "index.z"
-
-_AT_ONCE = 8
-"""Archives that are read at the same time."""
 
 _COMMIT = re.compile(r"(?<=[^/])@[0-9a-f]{40}(?=/|$)")
 _SAVE_S = 20.0
@@ -330,230 +324,3 @@ def _stamp_of(file: LocalFile) -> str:
 
 def _is_packed(name: str) -> bool:
     return not name.lower().endswith(".tar")
-
-
-class ArchiveTree:
-    """The folder that archives were made of.
-
-    `text` is what it is called: the folder that holds the archives, or the only one. `progress`
-    is called with the bytes of archives that were looked through, and those of all.
-    """
-
-    def __init__(
-        self,
-        text: str,
-        archives: Sequence[Archive],
-        progress: Callable[[int, int], None] = lambda *_: None,
-    ) -> None:
-        self.text, self.archives, self._progress = text, tuple(archives), progress
-
-    def __reduce__(self) -> tuple[type, tuple[str, tuple[Archive, ...]]]:
-        return ArchiveTree, (self.text, self.archives)  # Indexes stay in the cache.
-
-    @cached_property
-    def indexes(self) -> dict[Archive, Index]:
-        """What each archive holds; those of an object store are read at the same time.
-
-        OSError if one cannot be read. What was found by then is kept.
-        """
-        passed, total = dict[Archive, int](), sum(archive.size for archive in self.archives)
-
-        def index(archive: Archive) -> Index:
-            def tell(at: int) -> None:
-                passed[archive] = at
-                self._progress(sum(list(passed.values())), total)
-
-            return archive.index(tell)
-
-        # Local ones one by one here: who stops a scan waits for none of them.
-        remote = [archive for archive in self.archives if isinstance(archive.place, RemotePlace)]
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
-            coming = {archive: pool.submit(index, archive) for archive in remote}
-            return {
-                archive: coming[archive].result() if archive in coming else index(archive)
-                for archive in self.archives
-            }
-
-    @cached_property
-    def members(self) -> dict[str, tuple[Archive, Entry]]:
-        """Where the members lie that may be asked for, by name."""
-        members: dict[str, tuple[Archive, Entry]] = {}
-        for archive, index in self.indexes.items():
-            for name, entry in index.members.items():
-                if not archive.is_wanted(name):
-                    continue
-                if name in members:
-                    other = shown(members[name][0].place)
-                    entry = entry._replace(problem=f"{name} lies in {other} as well")
-                members[name] = archive, entry
-        return members
-
-    def listing(self) -> MemberListing:
-        """Return the names that may be asked for, and what is damaged."""
-        faults = {a.place.name: index.fault for a, index in self.indexes.items() if index.fault}
-        return MemberListing(self.members, faults)
-
-
-class ArchivePlace(PlaceByText):
-    """The tree of archives, with an empty `path`, or a file in it.
-
-    `archive` and `entry` tell where it lies; without them there is no such file.
-    """
-
-    def __init__(
-        self,
-        tree: ArchiveTree,
-        path: str = "",
-        archive: Archive | None = None,
-        entry: Entry | None = None,
-    ) -> None:
-        self.tree, self.path, self.archive, self.entry = tree, path, archive, entry
-
-    def __eq__(self, other: object) -> bool:
-        if type(other) is not ArchivePlace:
-            return False
-        return (self.tree.archives, self.path) == (other.tree.archives, other.path)
-
-    __hash__ = PlaceByText.__hash__
-
-    def __str__(self) -> str:
-        base = self.tree.text if self.archive is None else shown(self.archive.place)
-        return f"{base}/{self.path}" if self.path else base
-
-    @property
-    def size(self) -> int:
-        """Its bytes; 0 where there is none."""
-        return 0 if self.entry is None else self.entry.size
-
-    @property
-    def parent(self) -> Self:
-        """The folder that holds it."""
-        return self._below(self.path.rpartition("/")[0])
-
-    def __truediv__(self, key: str) -> Self:
-        return self._below(f"{self.path}/{key}" if self.path else key)
-
-    def exists(self) -> bool:
-        """Whether there is a file, or this is the tree."""
-        return self.is_dir() or self.is_file()
-
-    def is_dir(self) -> bool:
-        """Whether this is the tree; other folders are not looked for."""
-        return not self.path
-
-    def is_file(self) -> bool:
-        """Whether there is a file."""
-        return self.entry is not None
-
-    def _opened(self) -> IO[bytes]:
-        return io.BytesIO(self.read_bytes())
-
-    def read_bytes(self) -> bytes:
-        """Read a file whole.
-
-        FileNotFoundError if there is none, InputError if it is no plain file or the archive is
-        another one by now.
-        """
-        if self.archive is None or self.entry is None:
-            raise FileNotFoundError(errno.ENOENT, "is in no archive", str(self))
-        if self.entry.problem:
-            raise InputError(self, self.entry.problem, "a plain file that lies there once")
-        return self.archive.read(self.entry)
-
-    def state(self) -> Noted:
-        """Return what tells whether it was changed since; None where that cannot be told."""
-        if self.archive is None or self.entry is None or not self.archive.trusted:
-            return None
-        return (str(self), self.archive.stamp, *self.entry)
-
-    def _below(self, path: str) -> Self:
-        archive, entry = self.tree.members.get(path, (None, None))
-        return type(self)(self.tree, path, archive, entry)
-
-
-class MemberListing(RemoteListing):
-    """Names in archives; those that are damaged look like folders that cannot be listed."""
-
-    def __init__(self, files: Iterable[str], faults: dict[str, str]) -> None:
-        super().__init__(files)
-        self._faults = faults
-
-    def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
-        """See `slatprep.storage.files.Listing`."""
-        if fault := self._faults.get(folder.rstrip("/")):
-            raise OSError(errno.EIO, fault, folder.rstrip("/"))
-        found = list(super().of_folder(folder, folders=folders))
-        return [*found, *self._faults] if folders and not folder else found
-
-
-_GAP, _MOST = 2**18, 2**24
-"""Bytes between members that are read with them; bytes of one request with several members."""
-
-
-Members = list[Entry]
-
-
-def fetch(wanted: Iterable[tuple[Archive, Entry]], progress: Callable[[int, int], None]) -> None:
-    """Bring members into the cache that are not there.
-
-    `progress` is called with the bytes that were fetched and those in all. ConfigError if an
-    archive cannot be read; one that was replaced is left to whoever reads its members.
-    """
-    requests = list(_requests(wanted))
-    total, done = sum(_span(members)[1] for _, members in requests), 0
-    if not requests:
-        return
-    progress(0, total)
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        coming = {pool.submit(_bring, *request): request for request in requests}
-        try:
-            for future in as_completed(coming):
-                archive, members = coming[future]
-                try:
-                    future.result()
-                except InputError:
-                    pass
-                except OSError as error:
-                    raise ConfigError(
-                        f"{shown(archive.place)}: cannot be read ({error.strerror or error}); run "
-                        "again: what was fetched is kept"
-                    ) from None
-                done += _span(members)[1]
-                progress(done, total)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _requests(wanted: Iterable[tuple[Archive, Entry]]) -> Iterator[tuple[Archive, Members]]:
-    """Yield members that one request brings: of one archive, and near each other."""
-    missing: dict[Archive, Members] = {}
-    for archive, entry in wanted:
-        unusable = archive.packed or entry.problem or entry.size > MAX_KEPT
-        if not (unusable or archive.holds(entry)):
-            missing.setdefault(archive, []).append(entry)
-    for archive, members in missing.items():
-        near: Members = []
-        for entry in sorted(set(members), key=lambda one: one.offset):
-            _, length = _span([*near, entry])
-            last = near[-1].offset + near[-1].size if near else 0
-            if near and (entry.offset - last > _GAP or length > _MOST):
-                yield archive, near
-                near = []
-            near.append(entry)
-        if near:
-            yield archive, near
-
-
-def _span(members: Members) -> tuple[int, int]:
-    """Return where the header of the first member begins, and the bytes to the last one's end."""
-    begin = members[0].offset - BLOCK
-    return begin, members[-1].offset + members[-1].size - begin
-
-
-def _bring(archive: Archive, members: Members) -> None:
-    begin, length = _span(members)
-    data = archive.range(length, begin)
-    for entry in members:
-        at = entry.offset - BLOCK - begin
-        archive.keep(entry, archive.checked(entry, data[at : at + BLOCK + entry.size]))

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
 
 from slatprep.errors import InputError, StoreError
-from slatprep.storage.archives import Archive, ArchivePlace
+from slatprep.storage.archives import Archive
 from slatprep.storage.atomic import staged
 from slatprep.storage.cache import cached_file, copied_version, folder_for
 from slatprep.storage.files import (
@@ -30,6 +30,7 @@ from slatprep.storage.files import (
     local_files,
     open_regular,
 )
+from slatprep.storage.members import ArchivePlace
 from slatprep.storage.remote import (
     RemoteFile,
     RemoteFolder,

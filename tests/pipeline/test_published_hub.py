@@ -84,7 +84,7 @@ def test_bytes_are_told_and_what_was_fetched_is_kept_when_a_build_stops(
 ):
     lines: list[str] = []
     monkeypatch.setattr("slatprep.readers.published._EVERY_S", 0.0)
-    monkeypatch.setattr("slatprep.storage.archives._AT_ONCE", 1)
+    monkeypatch.setattr("slatprep.storage.members._AT_ONCE", 1)
     hub.delay = 0.05
 
     def stop(line: str) -> None:

@@ -1,0 +1,223 @@
+"""`slatprep evaluate`: the errors of predictions, beside those of others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import click
+
+from slatprep.cli import options
+from slatprep.cli.output import Output, write_csv
+from slatprep.cli.signature import Click, command
+
+if TYPE_CHECKING:
+    from slatprep.learn.compare import Comparison
+    from slatprep.learn.metrics import Evaluation, Measure, Measures
+    from slatprep.learn.published import PublishedScore
+    from slatprep.records import Place
+
+
+@command()
+def evaluate(
+    output: Output,
+    predictions: options.FileOrFolder | None = None,
+    *,
+    store: options.FolderOrUrl,
+    grids: tuple[str, ...] = (),
+    split: Annotated[Any, options.ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "test",
+    splits: options.SplitOptions,
+    spread: Annotated[Any, options.ChoiceOf("slatprep.learn.metrics:SPREADS")] = "se",
+    csv_file: Annotated[options.NewFile | None, Click("--csv")] = None,
+    picture: options.NewFile | None = None,
+    beside: tuple[str, ...] = (),
+) -> None:
+    """Measure PREDICTIONS by Pixie's protocol.
+
+    PREDICTIONS is a folder with an npz for each asset, or a Zarr group or
+    HDF5 file with a group for each asset. Each has properties (N,3) in
+    normalised space, and may have material (N,) or logits (N,8), coords
+    (N,3), and ranges (3,2) if they differ from the store's. Errors are means
+    over valid voxels, then over objects. The exit code is 1 if an asset of
+    the split has no prediction. Beside the run.json of a training, the split
+    is that of the run, unless --split-by or --shares is given.
+
+    Parameters
+    ----------
+    store : STORE.zarr
+        The store with the labels.
+    grids : [NAME=]DIR
+        Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, of 11 or 4 channels;
+        may be repeated. They are measured on their own voxels and looked up at the SLAT's, on the
+        same objects as PREDICTIONS, which may be left out.
+    split
+        Only objects of this split.
+    spread
+        Standard error or standard deviation over objects, or what Pixie prints.
+    csv_file
+        Also write the table to this file.
+    picture
+        With --grids, also draw the table as a PNG.
+    beside : pixie|slat-phys|FILE.csv
+        Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a CSV with
+        names in the first column and columns named as here; may be repeated.
+
+    Example
+    -------
+    slatprep evaluate runs/small/predictions --store data/demo.zarr
+    slatprep evaluate predictions.h5 --store data/demo.zarr --split all --spread sd --csv scores.csv
+    slatprep evaluate predictions --store pixieverse.zarr --split-by test_set.json
+    slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
+    slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
+    """
+    from slatprep.learn.metrics import OURS, SPREADS, evaluate_store
+    from slatprep.learn.published import TABLES, read_scores
+
+    if predictions is None and not grids:
+        raise click.UsageError("nothing to measure; give PREDICTIONS, --grids, or both")
+    if picture is not None and not grids:
+        raise click.UsageError("--picture draws methods side by side; give --grids as well")
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise click.BadParameter(f"{picture} does not end in .png", param_hint="--picture")
+    folders = _folders_of_grids(grids)
+    others = {
+        name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
+    }
+    chosen = _selected(output, predictions, store, split, splits) | {"spread": spread}
+    part = None if split == "all" else split
+    result: Evaluation | Comparison
+    baselines: Measures = {}
+    if grids:
+        from slatprep.learn.compare import compare_methods
+
+        result = compare_methods(predictions, folders, store, part, **chosen)
+        measures = ours = result.methods
+        what, problems = "method", result.problems
+        if problems:
+            output.note(
+                "note:    assets without a usable prediction of some method, left out of all: "
+                f"{len(problems)}"
+            )
+        if result.partly_annotated:
+            output.note(
+                "note:    objects with occupied voxels that have no annotation and are not scored: "
+                f"{result.partly_annotated}; Pixie's loader leaves such objects out"
+            )
+    else:
+        result = evaluate_store(cast("Path", predictions), store, part, **chosen)
+        measures = {name or "(none)": m for name, m in result.categories.items()}
+        measures |= {"all": result.overall}
+        ours, what = {OURS: result.overall}, "category"
+        baselines = result.baselines
+        problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
+        if result.converted:
+            output.note(
+                "note:    predictions normalised by other ranges, converted to the store's: "
+                f"{result.converted}"
+            )
+    if csv_file is not None:
+        _write_scores(csv_file, what, measures, spread)
+    if picture is not None:
+        from slatprep.learn.compare import draw_comparison
+
+        options.draw_to(output, picture, partial(draw_comparison, measures, SPREADS[spread]))
+
+    output.problems(problems, "--json lists them")
+    document = vars(result) | {"store": store}
+    if beside:
+        document["beside"] = [score for scores in others.values() for score in scores]
+
+    def show() -> None:
+        names = tuple(next(iter(measures.values())).means)
+        output.table(
+            "Mean squared error in normalised space, class accuracy "
+            f"(± {SPREADS[spread]} over n objects)",
+            (what, "n", *names),
+            [_row_of_scores(name, one) for name, one in (measures | baselines).items()],
+        )
+        if TABLES.keys() & others:
+            output.note(
+                "note: those beside were measured on PixieVerse's test objects; they compare only "
+                "with predictions of the same objects, normalised by Pixie's ranges (--ranges "
+                "pixie)"
+            )
+        means = {name: one.means for name, one in ours.items()}
+        for name, scores in others.items():
+            title = TABLES[name][0] if name in TABLES else name
+            _show_beside(output, f"Beside {title}", means, scores)
+
+    output.result(document, show, complete=not problems)
+
+
+def _selected(
+    output: Output, predictions: Path | None, store: Place, split: str, splits: options.SplitOptions
+) -> dict[str, Any]:
+    """Return the split of each object and which assets count, by the options or else by a run."""
+    from slatprep.learn.predictions import selection_of_run
+
+    filters: dict[str, Any] = {}
+    rule, how = splits.rule, f"by {splits.rule['by']}"
+    run = selection_of_run(predictions) if predictions and not splits.given else None
+    if run is not None:
+        file, rule, filters = run
+        how = f"as {file} says"
+    elif not splits.given:
+        how += ", as no run lies beside the predictions (others: --split-by, --split all)"
+    opened = options.opened(store)
+    return {"splits": options.split_of_objects(output, opened, rule, f"{split}, {how}"), **filters}
+
+
+def _folders_of_grids(grids: tuple[str, ...]) -> dict[str, Path]:
+    """Return the folders of ``--grids`` by the method's name, by default the folder's name."""
+    folders: dict[str, Path] = {}
+    for text in grids:
+        name, _, rest = text.rpartition("=")
+        folder = Path(text) if Path(text).is_dir() else Path(rest)
+        if not rest or not folder.is_dir():
+            raise click.BadParameter(f"{text!r} is no folder", param_hint="--grids")
+        name = folder.resolve().name if folder == Path(text) else name.strip()
+        if not name:
+            raise click.BadParameter(f"{text!r} has no name before =", param_hint="--grids")
+        if name in folders:
+            raise click.BadParameter(
+                f"two folders are called {name!r}; name them apart: NAME=DIR", param_hint="--grids"
+            )
+        folders[name] = folder
+    return folders
+
+
+def _write_scores(file: Path, what: str, measures: Mapping[str, Measure], spread: str) -> None:
+    metrics = next(iter(measures.values())).means
+    names = (name for mean in metrics for name in (mean, f"{mean} {spread}"))
+    rows = (
+        (name, m.objects, *(s[key] for key in metrics for s in (m.means, m.spreads)))
+        for name, m in measures.items()
+    )
+    write_csv(file, (what, "objects", *names), rows)
+
+
+def _show_beside(
+    output: Output,
+    title: str,
+    ours: Mapping[str, Mapping[str, float]],
+    others: tuple[PublishedScore, ...],
+) -> None:
+    names = tuple(next(iter(ours.values())))
+    means = [*ours.items(), *((score.method, score.means) for score in others)]
+    rows = [(name, *map(own.get, names)) for name, own in means]
+    output.table(title, ("method", *names), rows)
+    spreads = [
+        (one.method, *map(one.spreads.get, names), one.spread) for one in others if one.spreads
+    ]
+    if spreads:
+        output.table("Their spreads, as printed", ("method", *names, "kind"), spreads)
+
+
+def _row_of_scores(name: str, scores: Measure) -> tuple[str | int, ...]:
+    """Return a row of the printed table: each mean with its spread, if there is one."""
+    cells = zip(scores.means.values(), scores.spreads.values(), strict=True)
+    texts = (f"{mean:.3f}" + ("" if math.isnan(s) else f"±{s:.3f}") for mean, s in cells)
+    return name, scores.objects, *texts
