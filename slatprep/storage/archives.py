@@ -2,8 +2,8 @@
 
 A `members.ArchivePlace` is a file of the tree that several of them make up. Of an uncompressed
 archive only headers are read, and the members that are asked for; where they lie is kept in the
-cache for as long as the archive is the same. Of one with gzip, and of any on an object store, members are
-kept as well: they come from there but once.
+cache for as long as the archive is the same. Of one with gzip, and of any on an object store,
+members are kept as well: they come from there but once.
 """
 
 from __future__ import annotations
