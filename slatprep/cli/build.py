@@ -131,7 +131,7 @@ def build_store(
     ] = 0.01,
     compact: bool = False,
     keep_work: bool = False,
-    decoys: options.Seed = 200,
+    decoys: options.Count = 200,
     dry_run: bool = False,
     workers: options.WorkersOptions,
 ) -> None:

@@ -253,7 +253,7 @@ def measure_errors(
     store: options.LastStore,
     *,
     decoys: options.Positive = 200,
-    seed: int = 0,
+    seed: options.Seed = 0,
     picture: options.DrawnFile | None = None,
     jobs: options.Jobs = 1,
 ) -> None:

@@ -77,7 +77,7 @@ class TrainingOptions:
     ] = "none"
     max_ambiguity: Annotated[float | None, options.FiniteRange(min=0)] = None
     weigh_by_confidence: bool = False
-    seed: int = 0
+    seed: options.Seed = 0
 
 
 @command()
@@ -93,7 +93,7 @@ def train(
     verdicts: options.UsableVerdicts = None,
     splits: options.SplitOptions,
     device: Literal["cpu", "cuda"] = "cpu",
-    workers: Annotated[int, click.IntRange(min=0)] = 0,
+    workers: options.Count = 0,
     threads: options.Positive | None = None,
 ) -> None:
     """Train SLAT-Phys's decoder on STORE.

@@ -83,7 +83,9 @@ class ChoiceOf(_Choice):
 
 Positive = Annotated[int, click.IntRange(min=1)]
 Above0 = Annotated[float, FiniteRange(min=0, min_open=True)]
-Seed = Annotated[int, click.IntRange(min=0)]
+Count = Annotated[int, click.IntRange(min=0)]
+Seed = Count
+"""NumPy takes no negative one."""
 File = Annotated[Path, click.Path(path_type=Path, exists=True, dir_okay=False)]
 Folder = Annotated[Path, click.Path(path_type=Path, exists=True, file_okay=False)]
 FileOrFolder = Annotated[Path, click.Path(path_type=Path, exists=True)]

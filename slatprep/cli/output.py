@@ -132,7 +132,7 @@ class Output:
         """Return the length of unique prefixes of ids on a terminal, else None for whole ids."""
         if not sys.stdout.isatty():
             return None
-        length, ids = _LEAST_ID, sorted(ids)
+        length, ids = _LEAST_ID, sorted(set(ids))
         for one, next_one in itertools.pairwise(ids):
             while one[:length] == next_one[:length]:
                 length += 1

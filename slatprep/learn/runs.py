@@ -188,7 +188,8 @@ class Run:
     def log(self, history: Sequence[EpochRecord]) -> None:
         """Write ``log.csv``, and events for TensorBoard if it is installed."""
         names = [field.name for field in dataclasses.fields(EpochRecord)]
-        with (self.path / "log.csv").open("w", encoding="utf-8", newline="") as file:
+        log = self.path / "log.csv"
+        with staged(log) as path, path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(names)
             writer.writerows(dataclasses.astuple(record) for record in history)
@@ -196,9 +197,11 @@ class Run:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
             return
-        with SummaryWriter(str(self.path / "tensorboard")) as board:
+        epoch = history[-1].epoch
+        # An epoch that is repeated takes the place of what a killed run has logged of it.
+        with SummaryWriter(str(self.path / "tensorboard"), purge_step=epoch) as board:
             for name in names[1:]:
-                board.add_scalar(name, getattr(history[-1], name), history[-1].epoch)
+                board.add_scalar(name, getattr(history[-1], name), epoch)
 
     def draw(self, history: Sequence[EpochRecord], references: dict[str, float]) -> None:
         """Draw ``curve.png``: validation error by epoch, and the error (MSE) of each reference."""

@@ -179,11 +179,12 @@ def train(
             train_loss, rate = session.run_epoch(steps, lambda: run.save(LAST, session.state()))
             record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
             session.history.append(record)
-            run.save(LAST, session.state())
+            # `LAST` comes last: a run that is killed before it repeats the epoch.
             if session.best_epoch == record.epoch:
                 ranges, holds = opened.normalization, opened.contents
                 run.save(BEST, checkpoint_state(session.model, parameters.size, ranges, holds))
             run.log(session.history)
+            run.save(LAST, session.state())
             if progress is not None:
                 progress(record)
         references = {}

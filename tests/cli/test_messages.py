@@ -84,6 +84,8 @@ def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tm
         ("train STORE --out NEW --learning-rate inf", 2, "inf is no finite number"),
         ("train STORE --out NEW --max-ambiguity nan", 2, "nan is no finite number"),
         ("make-demo NEW --habitual-share nan", 2, "nan is no finite number"),
+        ("measure-errors STORE --seed -1", 2, "-1 is not in the range"),
+        ("train STORE --out NEW --seed -1", 2, "-1 is not in the range"),
         ("align --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below GRIDS"),
         ("build-store --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below"),
     ],

@@ -164,6 +164,7 @@ def test_ids_on_a_terminal_are_as_long_as_tells_them_apart(monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert module.Output().id_length(ids) == 11
     assert module.Output().id_length(["a", "b"]) == 8
+    assert module.Output().id_length(["0123456789", "0123456789"]) == 8, "of a damaged store"
 
 
 Few = Annotated[int, click.IntRange(1, 3)]

@@ -114,6 +114,38 @@ def test_a_stopped_run_goes_on_to_the_same_bits(learn_store, tmp_path, monkeypat
         assert read == logged, name
 
 
+@pytest.mark.parametrize("killed", range(3))
+def test_a_run_killed_at_the_end_of_an_epoch_goes_on_with_the_weights_it_names(
+    learn_store, tmp_path, monkeypatch, killed
+):
+    """Before each of the three writes of the end of an epoch, the only one."""
+    one, left = dataclasses.replace(SHORT, epochs=1), [killed]
+
+    def kill_before(name: str) -> None:
+        write = getattr(Run, name)
+
+        def killed_or_written(*arguments: object) -> None:
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            write(*arguments)
+
+        killing.setattr(Run, name, killed_or_written)
+
+    with monkeypatch.context() as killing, pytest.raises(KeyboardInterrupt):
+        kill_before("save")
+        kill_before("log")
+        train(learn_store, tmp_path, one)
+    train(learn_store, tmp_path, one)
+    last, best = (weights_of(tmp_path / name) for name in (LAST, BEST))
+    assert all(torch.equal(last[key], best[key]) for key in last)
+    assert len((tmp_path / "log.csv").read_text().splitlines()) == 2
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("train_loss")] == [0]
+
+
 def test_wrong_runs_are_named(learn_store, tmp_path):
     out = tmp_path / "run"
     one = dataclasses.replace(SHORT, epochs=1)

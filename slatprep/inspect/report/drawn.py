@@ -11,7 +11,7 @@ holds, for n voxels per edge and voxels in C order of the grid::
 
     n^3 / 8 bytes   occupancy of the SLAT, most significant bit first
     n^3 / 8 bytes   occupancy of the PixieVerse boundary, in its own frame
-    N bytes each    class, E, density, Poisson's ratio, distance of the SLAT voxels
+    N bytes each    class, each property, distance of the SLAT voxels
     K bytes         class of the boundary voxels
 
 and for a deformed asset also::
@@ -195,8 +195,8 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, side: int) -> bytes:
     chosen, grid_occupied = _cells(grid, side)
     farthest = asset.store.about.build.parameters.sample.max_distance
     distance = asset.distance[first] / farthest
+    # Properties are NaN where not valid.
     scalars = np.column_stack([(asset.properties[first] + 1.0) / 2.0, distance])
-    scalars[~asset.valid[first], :3] = np.nan
     parts = [
         occupied,
         grid_occupied,

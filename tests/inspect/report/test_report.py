@@ -6,6 +6,7 @@ import io
 import json
 import re
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +25,10 @@ from slatprep.inspect import report
 from slatprep.inspect.overview import overview_of
 from slatprep.inspect.report import write_report
 from slatprep.inspect.report.content import kinds_of, nearest_quarter_turn, quarter_turns
+from slatprep.inspect.report.drawn import encode_asset
+from slatprep.records import RESOLUTION, UNANNOTATED
 from slatprep.store import open_store
+from slatprep.store.records import StoredRecords
 
 IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]
 
@@ -46,6 +50,22 @@ def unpack(page: Page, index: int) -> dict[str, np.ndarray]:
         moved = rest[4:].view(np.int8).reshape(field.shape) * float(rest[:4].view("<f4")[0])
     return {"slat": slat, "field": field, "columns": columns, "field_material": material,
             "moved": moved}  # fmt: skip
+
+
+def test_a_voxel_without_annotation_keeps_its_distance_however_many_properties_there_are(hostile):
+    asset = open_store(hostile.store).asset(0)
+    valid = np.arange(len(asset.coords)) % 2 == 0
+    given = np.where(valid[:, None], asset.properties, np.nan).astype(np.float32)
+    told = replace(asset, valid=valid, properties=given)
+    way = StoredRecords(asset.store).place_map(asset)
+    columns = []
+    for properties in (told.properties, told.properties[:, :1]):
+        data = encode_asset(replace(told, properties=properties), way, RESOLUTION)
+        scalars = np.frombuffer(zlib.decompress(data, -zlib.MAX_WBITS), np.uint8)
+        scalars = scalars[RESOLUTION**3 // 4 :][: (2 + properties.shape[1]) * len(valid)]
+        columns.append(scalars.reshape(-1, len(valid)))
+    assert (columns[1][-1] == columns[0][-1]).all() and (columns[1][-1] < UNANNOTATED).all()
+    assert ((columns[0][1:-1] == UNANNOTATED).sum(axis=1) == (~valid).sum()).all()
 
 
 # -- what it lists ------------------------------------------------------------
