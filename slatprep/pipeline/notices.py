@@ -13,7 +13,7 @@ from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import NextStore, Row, moments_of
-from slatprep.readers.contents import ENOUGH, in_words, look_standardised
+from slatprep.readers.contents import ENOUGH, in_words, look_standardised, pooled_moments
 from slatprep.readers.joins import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Verdict
 from slatprep.store.record import FailedRecord
@@ -144,16 +144,18 @@ def _first(names: Sequence[str]) -> str:
 def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
     """Yield what a person should know about whether the latents of a store are standardised."""
     latents = new.contents.latents
-    known = [
-        (row.asset_id, moments)
-        for row, moments in zip(new.rows, moments_of(new.rows, new.stores), strict=True)
-        if row.n_voxels >= ENOUGH and moments
-    ]
-    looks = {name: look_standardised(moments, latents) for name, moments in known}
+    moments = moments_of(new.rows, new.stores)
+    known = [(row, own) for row, own in zip(new.rows, moments, strict=True) if own]
+    looks = {
+        row.asset_id: look_standardised(own, latents)
+        for row, own in known
+        if row.n_voxels >= ENOUGH
+    }
     if latents.standardised and standardised == "auto":
+        pooled = pooled_moments([(row.n_voxels, own) for row, own in known])
         yield (
-            f"the latents look standardised already ({in_words(known[0][1])} in {known[0][0]}) and "
-            'are marked so; say slat.standardised = "yes" if they are, "no" if they are not'
+            f"the latents look standardised already ({in_words(pooled)}) and are marked so; say "
+            'slat.standardised = "yes" if they are, "no" if they are not'
         )
     others = [name for name, look in looks.items() if look != latents.standardised]
     if others and standardised != "no":

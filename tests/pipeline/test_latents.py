@@ -79,6 +79,15 @@ def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tm
         assert open_store(out).contents.latents.standardised == (said == "yes")
 
 
+def test_assets_too_small_to_tell_alone_tell_together(dataset, tmp_path):
+    for name, asset in dataset.assets.items():
+        few = np.linspace(0, len(asset.coords) - 1, 40).astype(int)
+        dataset.write_slat(f"{name}.npz", asset.coords[few], ((asset.feats - MEAN) / STD)[few])
+    (warning,) = of_latents(build_store(dataset.parameters(), tmp_path / "s.zarr").warnings)
+    assert "look standardised already" in warning
+    assert open_store(tmp_path / "s.zarr").contents.latents.standardised
+
+
 def test_one_asset_unlike_the_others_is_named(dataset, tmp_path):
     asset = dataset.assets["c"]
     dataset.write_slat("c.npz", asset.coords, (asset.feats - MEAN) / STD)
