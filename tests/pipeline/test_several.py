@@ -20,7 +20,7 @@ from slatprep.parameters import BuildParameters, ConsensusParameters, Pixieverse
 from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
 from slatprep.pipeline.join import concat_stores, subset_store
-from slatprep.records import SourceRoots
+from slatprep.records import SourceRoots, Units
 from slatprep.store import open_store
 
 FACTORS = (1.0, 3.0, 0.7)
@@ -204,6 +204,14 @@ def test_a_store_of_merged_labels_is_sound(merged):
     np.testing.assert_allclose(
         check.value("mean spread of youngs_modulus"), asset.spread[:, 0].mean(), rtol=1e-6
     )
+
+
+def test_labels_are_made_again_in_the_units_that_were_stated(own, tmp_path):
+    parameters, out = asked(own), tmp_path / "s.zarr"
+    stated = {"units": Units(density="g/cm^3"), "plausibility": "warn"}
+    build_store(replace(parameters, pixieverse=replace(parameters.pixieverse, **stated)), out)
+    assert open_store(out).asset("a").merged
+    assert verify_store(out, sources=True).findings == ()
 
 
 def test_labels_are_made_again_of_sources_that_moved(own, tmp_path):

@@ -58,7 +58,7 @@ def source_roots(manifests: Place | None) -> SourceRoots:
 
 
 def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
-    """Return roots that were moved since the build, with the adapters that its record names."""
+    """Return roots that were moved since the build, read as its record says."""
     try:
         build = None if manifests is None else build_in(manifests).parameters
     except StoreError:
@@ -70,6 +70,8 @@ def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
         replace(
             one,
             adapter=source.adapter,
+            units=source.units,
+            plausibility=source.plausibility,
             pixieverse=locate_grids(replace(source, root=one.pixieverse)),
         )
         for one, source in sources
