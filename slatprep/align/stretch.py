@@ -61,9 +61,12 @@ def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
     for pose in range(len(poses.scales)):
         rotation, shift, scale = poses.rotations[pose], poses.shifts[pose], poses.scales[pose]
         affine, before = affines[pose], affines[pose].copy()
+        offset = poses.offsets[pose]
         for turn in range(len(taus) + 1):
-            if not _LEAST < invert(affine, inverse) < _MOST:
+            sound = _LEAST < invert(affine, inverse) < _MOST
+            if not (sound and math.isfinite(poses.offsets[pose])):
                 affine[:] = before
+                poses.offsets[pose] = offset
                 break
             offset = poses.offsets[pose]
             forward, backward = _links(rotation, shift, scale, offset, affine, inverse)
@@ -89,8 +92,4 @@ def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
                     affine[i, 3] -= step[4 * i + j] * centre[j]
                 affine[i, 3] += step[4 * i + 3]
             poses.offsets[pose] += step[12]
-            if not math.isfinite(poses.offsets[pose]):
-                affine[:] = before
-                poses.offsets[pose] = offset
-                break
     return scores

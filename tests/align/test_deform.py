@@ -316,3 +316,15 @@ def test_a_pose_that_would_be_squashed_flat_scores_nothing():
     affines[0, :, :3] *= 0.5
     scores = stretch(flat.samples, flat.samples, poses, affines, np.array([5.0]))
     assert scores[0] == 0.0
+
+
+def test_a_step_that_would_squash_it_flat_is_not_taken_nor_is_its_offset():
+    large, small = (np.zeros((64, 64, 64), dtype=bool) for _ in range(2))
+    large[20:44, 20:44, 20:44], small[27:37, 27:37, 27:37] = True, True
+    slat, pixie = surface_of(large).subset(60), surface_of(small).subset(60)
+    pose, affine = Similarity(np.eye(3), np.zeros(3), 1.0, offset=0.3), np.eye(3, 4)
+    affine[:, :3] *= 0.6
+    found, offset, score = stretched(slat, pixie, pose, affine, 5.0)
+    assert score == 0.0
+    np.testing.assert_array_equal(found, affine)
+    assert offset == pose.offset
