@@ -157,7 +157,7 @@ def extract(
 
     Without `preprocess` the images have no background and are cropped already. Yields the result
     of each, or why it failed, which does not stop the others. An existing SLAT whose record has
-    the same image, seed and model is kept.
+    the same image, seed and model is kept, whatever versions of slatprep and torch made it.
     """
     for extraction in extractions:
         try:
@@ -252,7 +252,7 @@ def _kept(extraction: Extraction, record: dict[str, Any]) -> Extracted:
     try:
         before = json.loads(extraction.record.read_text("utf-8"))
         slat = before.pop("slat")
-        if before == record and file_digest(extraction.slat) == slat["sha256"]:
+        if _asked_for(before) == _asked_for(record) and file_digest(extraction.slat) == slat["sha256"]:
             return Extracted(int(slat["voxels"]), kept=True)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         pass  # A record that cannot be read does not identify the file either.
@@ -261,6 +261,13 @@ def _kept(extraction: Extraction, record: dict[str, Any]) -> Extracted:
         "exists, and its record does not say that it came from this image, seed and model",
         "a new folder, or that you move the file away",
     )
+
+
+def _asked_for(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record without versions and words: what a stopped run may go on with."""
+    model = {name: value for name, value in record["model"].items() if name != "torch"}
+    rest = {name: value for name, value in record.items() if name not in ("slatprep", "feats")}
+    return rest | {"model": model}
 
 
 def _read_image(path: Path) -> tuple[bytes, Image]:

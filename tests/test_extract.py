@@ -5,6 +5,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
@@ -109,7 +110,7 @@ def test_latents_and_their_record_are_what_the_pipeline_returns(session, images,
         assert record[key]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(session, images, tmp_path):
+def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(session, images, tmp_path, monkeypatch):
     for folder in ("a", "b"):
         run(session, images, tmp_path / folder, 3)
     for path in (tmp_path / "a").iterdir():
@@ -117,7 +118,12 @@ def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(session, images, 
     calls = len(session.pipeline.seen)
     again = run(session, images, tmp_path / "a", 3)
     assert all(result.kept for result in again) and len(session.pipeline.seen) == calls
-    other = run(session, images, tmp_path / "a", 4)
+    renewed = replace(session, model=session.model | {"torch": "9.9"})
+    assert all(result.kept for result in run(renewed, images, tmp_path / "a", 3))
+    monkeypatch.setattr(work.metadata, "version", lambda name: "9.9")
+    assert all(result.kept for result in run(session, images, tmp_path / "a", 3))
+    another = replace(session, model=session.model | {"revision": "def"})
+    other = run(session, images, tmp_path / "a", 4) + run(another, images, tmp_path / "a", 3)
     assert all(isinstance(result, InputError) for result in other)
     assert (tmp_path / "a" / "cup.npz").read_bytes() == (tmp_path / "b" / "cup.npz").read_bytes()
 

@@ -15,6 +15,7 @@ from slatprep.particles.fields import VoxelField
 from slatprep.particles.read import FRAMES, Axes, Particles, read_particles
 from slatprep.particles.transfer import doubt_axes, recognise_axes, transfer
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, Place
+from slatprep.storage.atomic import staged
 from slatprep.store import open_store
 
 CLASSES = MATERIAL_CLASSES[:BACKGROUND]
@@ -139,8 +140,14 @@ def write_frames(
     stretch: bool,
     progress: Callable[[int, int], None],
 ) -> int:
-    """Write ``frame-0000.ply`` and so on, and the picture; return the number of frames."""
+    """Write ``frame-0000.ply`` and so on, and the picture; return the number of frames.
+
+    Frames that an earlier run left in `out` are removed.
+    """
     out.mkdir(parents=True, exist_ok=True)
+    for old in out.glob("frame-*.ply"):  # A longer run would leave frames behind.
+        if old.stem.removeprefix("frame-").isdigit():
+            old.unlink()
     carrier = splats.bind(scene.places, scene.positions, scene.spacing)
     low = moved[0].min(axis=(0, 1)) - scene.spacing
     high = moved[0].max(axis=(0, 1)) + scene.spacing
@@ -149,7 +156,8 @@ def write_frames(
     for number, (positions, gradients) in enumerate(zip(*moved, strict=True)):
         places, local = splats.carry(carrier, positions, gradients)
         rows = splats.deform(scene.vertices, places, local, scene.axes, stretch=stretch)
-        splats.write_gaussians(out / f"frame-{number:04d}.ply", rows, FRAMES[scene.axes])
+        with staged(out / f"frame-{number:04d}.ply") as path:
+            splats.write_gaussians(path, rows, FRAMES[scene.axes])
         if picture is not None:
             pictures.append(splats.draw(rows, places, low, high))
         progress(number + 1, frames)

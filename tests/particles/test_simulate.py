@@ -18,6 +18,8 @@ from support.commands import document, run
 from support.synthetic import JELLY, METAL, make_asset
 
 from slatprep.errors import SlatprepError
+from slatprep.particles import motion
+from slatprep.particles.fields import VoxelField
 from slatprep.particles.gaussians import (
     bind,
     carry,
@@ -317,6 +319,21 @@ def test_what_cannot_be_simulated_is_said(words, said, tmp_path, monkeypatch):
     done = run("simulate", "--prediction", "p.npz", "--out", "frames", *words, code=None)
     assert done.exit_code in (1, 2) and said in done.stderr, done.stderr
     assert not (tmp_path / "frames").exists()
+
+
+def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path):
+    coords = write_prediction(tmp_path / "p.npz")
+    stuff = np.tile(np.float32(JELLY[1:]), (len(coords), 1))
+    field = VoxelField(coords.astype(np.uint8), np.zeros(len(coords), np.uint8), stuff)
+    scene = motion.prepare(field, None, None, None, 8)
+    for count in (3, 2):
+        moved = np.repeat(scene.positions[None], count, axis=0)
+        gradients = np.tile(np.eye(3, dtype=np.float32), (*moved.shape[:2], 1, 1))
+        out = tmp_path / "frames"
+        motion.write_frames(out, scene, (moved, gradients), 30, None, False, lambda *_: None)
+        (out / "frame-0001-mine.ply").touch()
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["frame-0000.ply", "frame-0001-mine.ply", "frame-0001.ply"]
 
 
 @needs_newton
