@@ -252,7 +252,10 @@ def _kept(extraction: Extraction, record: dict[str, Any]) -> Extracted:
     try:
         before = json.loads(extraction.record.read_text("utf-8"))
         slat = before.pop("slat")
-        if _asked_for(before) == _asked_for(record) and file_digest(extraction.slat) == slat["sha256"]:
+        if (
+            _asked_for(before) == _asked_for(record)
+            and file_digest(extraction.slat) == slat["sha256"]
+        ):
             return Extracted(int(slat["voxels"]), kept=True)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         pass  # A record that cannot be read does not identify the file either.

@@ -110,7 +110,9 @@ def test_latents_and_their_record_are_what_the_pipeline_returns(session, images,
         assert record[key]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(session, images, tmp_path, monkeypatch):
+def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(
+    session, images, tmp_path, monkeypatch
+):
     for folder in ("a", "b"):
         run(session, images, tmp_path / folder, 3)
     for path in (tmp_path / "a").iterdir():

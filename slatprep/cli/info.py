@@ -14,7 +14,6 @@ from slatprep.cli.signature import Click, command
 if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
     from slatprep.inspect.statistics import Distribution, GroupStatistics, StoreStatistics
-    from slatprep.records import Place
     from slatprep.store import Store
 
 
@@ -209,14 +208,9 @@ def report(
     slatprep report data/demo.zarr --out demo.html --manifests manifests/build/demo
     """
     from slatprep.inspect.report import write_report
-    from slatprep.store.records import manifests_beside
 
     opened = options.opened(store)
-    name = store.name.removesuffix(".zarr")
-    records: Place | None = manifests
-    if records is None:
-        of_make = Path("manifests/build") / name
-        records = manifests_beside(opened.path) or (of_make if of_make.is_dir() else None)
+    records = manifests or options.records_of(opened.path)
     if records is None:
         output.problem(
             f"no records of {store} found; the page cannot list assets that are not in the store. "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -10,11 +9,10 @@ import click
 from slatprep.cli import options
 from slatprep.cli.output import Cell, Output, say
 from slatprep.cli.signature import command
-from slatprep.errors import StoreError, amount
+from slatprep.errors import amount
 
 if TYPE_CHECKING:
     from slatprep.inspect.compare import AssetChange, StoreDifference
-    from slatprep.records import Place
 
 
 @command()
@@ -61,21 +59,18 @@ def verify(
     if (pixieverse is None) != (slat is None) or (also and slat is None):
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
     from slatprep.inspect.verify import SourceRoots, verify_store
-    from slatprep.store.records import manifests_beside
 
     roots = None
     if pixieverse and slat:
         further = tuple(SourceRoots(one, slat, number=k) for k, one in enumerate(also, 1))
         roots = SourceRoots(pixieverse, slat, also=further)
-    if manifests is None and manifests_beside(store) is None:
-        manifests = _left_by_make(store)
     with workers.started(output) as jobs, output.progress("verify") as progress:
         result = verify_store(
             store,
             sources=sources or roots is not None,
             roots=roots,
             sample=sample,
-            manifests=manifests,
+            manifests=manifests or options.records_of(store),
             jobs=jobs,
             progress=progress,
         )
@@ -93,18 +88,6 @@ def verify(
         say(f"{store}: {found}")
 
     output.result(result, show, complete=result.ok)
-
-
-def _left_by_make(store: Place) -> Place | None:
-    """Return the folder where `make align` leaves a store's records, if they are of this build."""
-    from slatprep.store.records import build_in
-
-    folder = Path("manifests/build") / store.name.removesuffix(".zarr")
-    try:
-        own = build_in(folder).id == options.opened(store).about.manifest
-    except (OSError, StoreError):
-        return None
-    return folder if own else None
 
 
 _SHOWN = 20

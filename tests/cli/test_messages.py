@@ -264,6 +264,8 @@ def test_the_records_that_make_left_are_found_and_those_of_another_build_are_not
     store = Path(shutil.copytree(str(mixed_build.store), "data/demo.zarr"))
     shutil.copytree(mixed_build.records.parent, "manifests/build/demo")
     assert "records: manifests/build/demo" in run("verify", store).output
+    assert "no records" not in run("report", store).output
     shutil.rmtree("manifests")
     shutil.copytree(deformed_build.records.parent, "manifests/build/demo")
     assert "records: none beside the store" in run("verify", store).output
+    assert "no records of data/demo.zarr found" in run("report", store).output
