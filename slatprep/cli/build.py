@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import click
@@ -313,16 +314,24 @@ def report(output: Output, summary: BuildSummary) -> None:
 
     def show() -> None:
         if summary.store is not None:
-            from slatprep.inspect.overview import overview_of
+            from slatprep.inspect.overview import list_assets, overview_of
 
             store, built = options.opened(summary.store), output.command == "build-store"
             # What a dataset definition may say is of no use to `subset` and `concat`.
             show_quality(output, overview_of(store), advise=built)
             show_errors(store)
+            if output.verbosity > 0:
+                names = ("asset_id", "verdict", "confidence", "fitness")
+                rows = map(attrgetter(*names), list_assets(store))
+                output.table("Assets", ("asset", *names[1:]), rows)
         # "failed" beside the verdicts would be read as one of them.
-        words = {"failed": "not built"} if output.command == "build-store" else {}
+        words = {"failed": "not aligned" if summary.store is None else "not built"}
         others = ", ".join(f"{n:,} {words.get(key, key)}" for key, n in summary.statuses.items())
         say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
+        if summary.unchanged:
+            say(f"changed: nothing; {amount(good, 'asset')} reused")
+        if summary.removed:
+            say(f"removed: {amount(summary.removed, 'asset')} of the store that was there")
         if summary.store is not None:
             say(f"store:   {summary.store}")
         say(f"records: {summary.records}")

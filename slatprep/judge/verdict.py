@@ -262,7 +262,7 @@ def verdict_of(
     if math.isnan(same_object * right_placement):
         fitnesses = quality.fitness, quality.fitness_backward
         failed = any(fitness < limits.failed_fitness for fitness in fitnesses)
-        reasons += _low_fitness(quality)
+        reasons += _low_fitness(quality, f"(good needs {limits.good_fitness:.0%})")
     else:
         # Among placements that tie nobody has chosen yet: any of them may be right.
         tied = ties > 0 and ambiguity > limits.good_ambiguity
@@ -286,7 +286,8 @@ def verdict_of(
             f"{others} about as well and would change the class of {ambiguity:.1%} of the "
             f"voxels (good needs {limits.good_ambiguity:.0%})"
         )
-    if mirrored > limits.good_mirrored:
+    # Of another object nobody can tell.
+    if mirrored > limits.good_mirrored and not same_object < limits.failed_confidence:
         reasons.append(
             "the annotation is a mirror image of its object, left for right: mirrored, it fits "
             f"better by {mirrored:.3f} in score (good needs at most {limits.good_mirrored:g})"
@@ -321,15 +322,15 @@ def _doubts(
     if same_object < limits.failed_confidence:
         reasons = [of_object]  # On another object no placement is right.
     if same_object <= right_placement:
-        reasons += _low_fitness(quality)
+        reasons += _low_fitness(quality, "before any deformation")
     return reasons
 
 
-def _low_fitness(quality: Quality) -> list[str]:
-    """Say which of the two fitnesses is low."""
+def _low_fitness(quality: Quality, told: str) -> list[str]:
+    """Say which of the two fitnesses is low, and what is `told` of them."""
     return [
-        f"only {fitness:.1%} of the {side} boundary lies within {quality.radius:g} voxel of the "
-        f"other side (good needs {THRESHOLDS.good_fitness:.0%})"
+        f"{fitness:.1%} of the {side} boundary lies within {quality.radius:g} voxel of the other "
+        f"side {told}"
         for side, fitness in (("PixieVerse", quality.fitness), ("SLAT", quality.fitness_backward))
         if fitness < THRESHOLDS.good_fitness
     ]

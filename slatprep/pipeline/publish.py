@@ -28,7 +28,7 @@ from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
-from slatprep.store.reader import Store, is_store, require_outside
+from slatprep.store.reader import Store, is_store, open_store, require_outside
 from slatprep.store.record import BuildCounts, BuildRecord, FailedRecord
 from slatprep.store.record_json import to_json
 from slatprep.store.records import (
@@ -53,8 +53,9 @@ class Destination:
     """Where a store and its records go; `store` is where it really lies, behind a link.
 
     `out` is the store as its user names it, `manifests` the folder of its records, if not beside
-    it. StoreError if there is something other than a store, or the folder holds files of other
-    origin or the records of another store; ConfigError if it lies in another store.
+    it. `removed` is how many assets of the store that was there the new one lacks. StoreError if
+    there is something other than a store, or the folder holds files of other origin or the records
+    of another store; ConfigError if it lies in another store.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
@@ -72,7 +73,8 @@ class Destination:
             _require_own(self._manifests or Path(str(manifests_of(path))), path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
-        self._replacing = False
+        self.replacing = False
+        self.removed = 0
 
     def look(self) -> None:
         """See, on an object store, what is published; raise `StoreError` if none may be there."""
@@ -85,7 +87,7 @@ class Destination:
         try:
             yield
         except KeyboardInterrupt:
-            if not self._replacing:
+            if not self.replacing:
                 raise
             told = f"{self.out} is the old store or the new one, whole; run it again"
             raise KeyboardInterrupt(told) from None
@@ -95,7 +97,9 @@ class Destination:
 
         `staged` is what of it is on the object store already.
         """
-        self._replacing = True
+        self.replacing = True
+        with suppress(StoreError):  # There was none, or its ids cannot be read.
+            self.removed = len(set(open_store(self.store).ids) - set(open_store(new).ids))
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)
         elif (path := storage_of(self.store).local) is not None:
@@ -232,6 +236,10 @@ class BuildSummary:
         What of the existing store was not as it was written, and was made anew.
     rehash_seed : int or None
         What the share of unchanged sources was drawn with that was hashed; None if none was.
+    removed : int
+        Assets of the store that was there which the new one lacks.
+    unchanged : bool
+        Whether the store that was there stayed as it was.
     """
 
     records: Place
@@ -250,6 +258,8 @@ class BuildSummary:
     damaged: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     rehash_seed: int | None = None
+    removed: int = 0
+    unchanged: bool = False
 
     @property
     def complete(self) -> bool:
@@ -319,6 +329,8 @@ def publish_store(
         build_id=store.about.manifest,
         store=place.out,
         normalization=store.normalization,
+        removed=place.removed,
+        unchanged=not place.replacing,
         **told,
     )
     try:

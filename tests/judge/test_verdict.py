@@ -67,9 +67,9 @@ def test_every_reason_is_named_once():
         "roughly only",
         "perhaps a wrong placement: it is right with a probability of 80.0% (good needs 90% for "
         "object and placement together)",
-        "only 70.0% of the PixieVerse boundary lies within 1.5 voxel of the other side "
-        "(good needs 80%)",
-        "only 60.0% of the SLAT boundary lies within 1.5 voxel of the other side (good needs 80%)",
+        "70.0% of the PixieVerse boundary lies within 1.5 voxel of the other side before any "
+        "deformation",
+        "60.0% of the SLAT boundary lies within 1.5 voxel of the other side before any deformation",
         "only 70.0% of the labels can be expected to be right (good needs 75%)",
         "only 70.0% of the SLAT voxels found an annotation (good needs 80%)",
         "2 other placements fit about as well and would change the class of 40.0% of the voxels "
@@ -83,6 +83,10 @@ def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(gain, g
     verdict, reasons = verdict_of(FINE, 1.0, same_object=0.99, right_placement=1.0, mirrored=gain)
     assert verdict is (Verdict.GOOD if good else Verdict.DOUBTFUL)
     assert len(reasons) == (0 if good else 1)
+    # Of another object it says nothing.
+    verdict, (reason,) = verdict_of(FINE, 1.0, 0, 0, 0.01, 1.0, mirrored=gain)
+    assert verdict is Verdict.FAILED
+    assert reason.startswith("probably another object")
 
 
 def test_without_a_cause_none_is_named_and_the_fitness_is():

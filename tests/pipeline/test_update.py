@@ -7,7 +7,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from support.commands import run
+from support.commands import document, run
 from support.faults import inject
 from support.first_builds import tree_from_nothing
 from support.synthetic import make_asset
@@ -52,6 +52,29 @@ def test_nothing_changed_writes_nothing_and_a_change_that_keeps_size_and_times_i
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
     assert path.stat().st_size == state.st_size
     assert reasons(dataset.parameters(), out)["a"] == ("align", "sources changed: slat")
+
+
+def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
+    dataset, out = built
+    words = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
+    assert "changed" not in run("build-store", *words, "--out", out, "--decoys", "0").stdout
+    again = run("build-store", *words, "--out", out, "--decoys", "0", "--verbose").stdout
+    assert "changed: nothing; 3 assets reused" in again
+    assert "removed" not in again
+    assert [line.split()[:2] for line in again.splitlines() if line[:2] in ("a ", "b ", "c ")] == [
+        [name, "good"] for name in "abc"
+    ]
+    (dataset.root / "slat" / "a.npz").unlink()
+    less = run("build-store", *words, "--out", out, "--decoys", "0", code=1).stdout
+    assert "removed: 1 asset of the store that was there" in less
+    assert "changed" not in less
+    other = out.with_name("other.zarr")
+    assert "removed" not in run("subset", out, "--asset", "b", "--out", other).stdout
+    said = run("subset", out, "--asset", "c", "--out", other).stdout
+    assert "assets:  1 (1 ok, 0 not built, 0 skipped)" in said
+    assert "removed: 1 asset" in said
+    fresh = document("build-store", *words, "--out", other, "--fresh", code=1)
+    assert (fresh["removed"], fresh["unchanged"]) == (0, False)
 
 
 @pytest.mark.parametrize("what", ["ranges", "shards"])
