@@ -16,6 +16,7 @@ from typing import Any
 
 from slatprep.errors import StoreError
 from slatprep.export.formats import COLUMNS
+from slatprep.records import MATERIAL_CLASSES, PROPERTIES, Contents
 from slatprep.store import Store
 
 CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
@@ -45,12 +46,6 @@ _CONTEXT: dict[str, Any] = {
 
 ZARR = "https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html"
 """The format of Zarr's files; no media type is registered for it."""
-
-DESCRIPTION = (
-    "PixieVerse material fields aligned with TRELLIS structured latents: for every latent voxel "
-    "its Young's modulus, density, Poisson's ratio and material class, normalised, with the "
-    "transform between the two frames and how far it can be trusted."
-)
 
 
 @dataclass(frozen=True)
@@ -90,7 +85,7 @@ def describe(store: Store, stated: Stated | None = None, location: str = "") -> 
     """
     location, stated = location or store.name, stated or Stated()
     more = {
-        "description": DESCRIPTION,
+        "description": description_of(store.contents),
         "license": stated.license,
         "url": stated.url,
         "citeAs": stated.cite_as,
@@ -107,6 +102,18 @@ def describe(store: Store, stated: Stated | None = None, location: str = "") -> 
         "distribution": _distribution(store, location),
         "recordSet": [_classes(store), _properties(store), _assets(store)],
     }
+
+
+def description_of(contents: Contents) -> str:
+    """Say in a sentence what a store holds."""
+    names = [one.title for one in contents.properties] + ["material class"] * bool(contents.classes)
+    listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    pixieverse = (contents.properties, contents.classes) == (PROPERTIES, MATERIAL_CLASSES)
+    return (
+        f"{'PixieVerse material' if pixieverse else 'Material'} fields aligned with structured "
+        f"latents (encoder {contents.latents.encoder}): for every latent voxel its {listed}, "
+        "normalised, with the transform between the two frames and how far it can be trusted."
+    )
 
 
 def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
@@ -182,11 +189,13 @@ def _record_set(
 
 
 def _classes(store: Store) -> dict[str, Any]:
+    classes = store.contents.classes
+    whose = "PhysGaussian's material" if classes == MATERIAL_CLASSES else "Material"
     return _record_set(
         "materials",
-        "PhysGaussian's material classes, the values of voxel/material and grid/material.",
+        f"{whose} classes, the values of voxel/material and grid/material.",
         {"id": ("sc:Integer", "value in the arrays"), "name": ("sc:Text", "name of the class")},
-        enumerate(store.attributes["material_classes"]),
+        enumerate(classes),
         dataType="sc:Enumeration",
     )
 

@@ -11,7 +11,7 @@ import hashlib
 import math
 import os
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -90,13 +90,13 @@ def group_arrays(
 
     holder = file
     for name in filter(None, group.split("/")):
-        holder = _child(holder, name, f"{path} [{group}]", h5py.Group)
+        holder = _child(holder, name, f"{path} [{group}]", h5py.Group, specs)
     arrays = {}
     for name, spec in specs.items():
         if partial and not holder.id.links.exists(name.encode()):
             continue
         where = f"{path} [{'/'.join(filter(None, (group, name)))}]"
-        arrays[name] = _read_dataset(_child(holder, name, where, h5py.Dataset), where, spec)
+        arrays[name] = _read_dataset(_child(holder, name, where, h5py.Dataset, specs), where, spec)
     return arrays
 
 
@@ -137,13 +137,13 @@ def _walk_groups(
                 yield from _walk_groups(inner, components[1:], *further)
 
 
-def _child(parent: h5py.Group, name: str, where: str, kind: type) -> Any:
+def _child(parent: h5py.Group, name: str, where: str, kind: type, names: Iterable[str]) -> Any:
     import h5py
 
     word, links = kind.__name__.lower(), parent.id.links
     # Asking h5py itself whether a name exists would follow an external link.
     if not links.exists(name.encode()):
-        raise InputError(where, f"has no {word} {name!r}", "coords and feats of one asset")
+        raise InputError(where, f"has no {word} {name!r}", _EXPECTED.format(", ".join(names)))
     if links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
         fault = f"{name!r} is a soft or external link"
         raise InputError(where, fault, f"the {word} itself in the file")

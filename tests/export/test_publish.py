@@ -18,13 +18,14 @@ import zarr
 from click.testing import Result
 from support import commands
 from support.faults import flip
-from support.made_store import rewrite
+from support.made_store import make_store, rewrite
 from support.published_hub import PublishedHub
 from support.trees import tree
 
 from slatprep.export.croissant import Stated, describe, to_json
 from slatprep.export.publish import card_of
 from slatprep.pipeline.dataset import BuildSummary
+from slatprep.records import Contents, Property
 from slatprep.store import Store, open_store
 from slatprep.store.layout import ARRAYS
 
@@ -226,6 +227,20 @@ def test_croissant_s_records_are_the_store_s(store, tmp_path):
     for row in dataset.records("properties"):
         stated = group.attrs["normalization"][row["properties/name"]]
         assert (row["properties/lo"], row["properties/hi"]) == (stated["lo"], stated["hi"])
+
+
+def test_croissant_says_what_a_store_of_other_contents_holds(tmp_path):
+    density, hue = Property("density", "kg/m^3", True), Property("hue", "1", False)
+    for table, classes, said in (
+        ((density, hue), ("oak", "elm"), "its density, hue and material class, normalised"),
+        ((density,), (), "its density, normalised"),
+    ):
+        store = tmp_path / f"{len(table)}.zarr"
+        make_store(store, Contents(table, classes))
+        opened = open_store(store)
+        text = to_json(describe(opened))
+        assert said in text and said in card_of(opened)
+        assert not any(word in text for word in ("PixieVerse material", "Young", "PhysGaussian"))
 
 
 def test_croissant_describes_figures_that_are_not_numbers(store, tmp_path):
