@@ -172,7 +172,7 @@ def card_of(
     parts = [
         "---\n" + "\n".join(lines) + "\n---",
         f"# {_plain(title)}",
-        croissant.description_of(about.contents),
+        _plain(croissant.description_of(about.contents)),
         *(f"![Some of the assets, aligned, and the error of each voxel]({n})" for n in pictures),
         "## What is in it",
         "\n".join(_table(store, kept)),

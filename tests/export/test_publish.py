@@ -239,7 +239,7 @@ def test_croissant_says_what_a_store_of_other_contents_holds(tmp_path):
         make_store(store, Contents(table, classes))
         opened = open_store(store)
         text = to_json(describe(opened))
-        assert said in text and said in card_of(opened)
+        assert said in text and said in card_of(opened, Stated(), "s.zarr", [])
         assert not any(word in text for word in ("PixieVerse material", "Young", "PhysGaussian"))
 
 
