@@ -261,8 +261,9 @@ def measure_errors(
 
     A decoy is an asset's grid aligned with the SLAT of another object of about its size.
     Decoys show how wrong pairs of this dataset score. No asset of the store is
-    aligned again, and no verdict is changed. What decoys gave is kept in decoys.json beside
-    the store, and taken over after an update. A build does the same with fewer decoys.
+    aligned again, and no verdict is changed. What decoys gave is kept beside the store, in
+    NAME.manifests/decoys.json, and taken over after an update. A build does the same with
+    fewer decoys.
 
     Parameters
     ----------

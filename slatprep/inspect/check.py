@@ -128,7 +128,8 @@ class AlignmentCheck:
         ties = f"the class of {open_share:.1%} of the voxels" if open_share else "no class"
         return (
             f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary lie "
-            f"within {self.radius:g} voxel of the other side; placements that fit as well change "
+            f"within {self.radius:g} voxel of the other side before any deformation; placements "
+            f"that fit as well change "
             f"{ties}",
         )
 

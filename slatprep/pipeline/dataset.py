@@ -314,7 +314,7 @@ def _publish(
             "they did; all sources were hashed"
         )
     if new and records is not None:
-        warnings += dataset_notices(new, parameters)
+        warnings += dataset_notices(new, parameters, failed)
     damaged = [f"{row.asset_id}: {row.damaged}" for row in rows if row.damaged]
     summary = publish_store(
         place,

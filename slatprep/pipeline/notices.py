@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+import re
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
@@ -26,6 +27,9 @@ _BESIDE_PIXIE = 0.5
 
 _NAMED = 3
 
+_LOOKS = re.compile(r"the values look like (.+?)(?: \(or |: )")
+"""What refused values look like, in the words of `slatprep.readers.values`."""
+
 
 def nothing_usable(
     failed: Sequence[FailedRecord], parameters: BuildParameters, pairs: Collection[AssetPair] = ()
@@ -46,25 +50,36 @@ def nothing_usable(
     )
 
 
-def dataset_notices(new: NextStore, parameters: BuildParameters) -> Iterator[str]:
+def dataset_notices(
+    new: NextStore, parameters: BuildParameters, failed: Sequence[FailedRecord] = ()
+) -> Iterator[str]:
     """Yield what a person should know of the assets of a store together."""
     yield from latent_warnings(new, parameters.slat.standardised)
     if not (parameters.consensus.settle or parameters.pixieverse.samples == "merge"):
         yield from shared_rotation(new)
-    yield from unusual_values(new.rows)
+    yield from unusual_values(new.rows, failed)
     yield from shared_sources(new)
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
         yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
 
 
-def unusual_values(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield once that values of new assets are unusual; their records tell of each."""
+def unusual_values(rows: Sequence[Row], failed: Sequence[FailedRecord] = ()) -> Iterator[str]:
+    """Yield once that values of new assets are unusual, and what refused ones look like.
+
+    The records tell of each.
+    """
     made = [row for row in rows if row.spooled]
     told = [(row.asset_id, str(row.columns["unusual"])) for row in made if row.columns["unusual"]]
     if told:
+        refused = Counter(look[1] for one in failed if (look := _LOOKS.search(one.reason)))
+        also = (
+            f"; {count} refused assets look like {unit}, and {'these' if told[1:] else 'this'} "
+            "probably too"
+            for unit, count in refused.most_common(1)
+        )
         yield (
             f"values of {len(told)} of {len(made)} assets are unusual "
-            f"({_first([name for name, _ in told])}): {told[0][1]}"
+            f"({_first([name for name, _ in told])}): {told[0][1]}{''.join(also)}"
         )
 
 

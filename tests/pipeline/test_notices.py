@@ -66,6 +66,21 @@ def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
     assert sum("plausibility: " in line for line in summary.records.open()) == 2
 
 
+def test_unusual_values_are_told_with_what_refused_ones_look_like(dataset, tmp_path):
+    for name in "abc":
+        grid = dataset.assets[name].grid
+        inside = np.argwhere(grid[..., 3] != 7)
+        # Of the third asset less than half is implausible.
+        some = tuple(inside[: int(len(inside) * (0.4 if name == "c" else 1))].T)
+        grid[some] = (300, 0.5, 0.3, 5)
+        dataset.write_grid(name, grid)
+    summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
+    assert [name for name, _ in summary.problems] == ["a", "b"]
+    (text,) = [text for text in summary.warnings if "unusual" in text]
+    assert text.startswith("values of 1 of 4 assets are unusual (c): its snow (40% of the voxels)")
+    assert "; 2 refused assets look like MPa, and this probably too" in text
+
+
 def test_one_asset_alone_does_not_tell_whether_it_is_standardised(make_dataset, tmp_path):
     dataset = make_dataset("a")
     coords = dataset.assets["a"].coords

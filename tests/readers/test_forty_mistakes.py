@@ -1,4 +1,4 @@
-"""Forty mistakes of units, layout, names and links: what docs/design/mistakes.md tells is said."""
+"""Mistakes of units, layout, names and links: what docs/design/mistakes.md tells is said."""
 
 import re
 import shutil

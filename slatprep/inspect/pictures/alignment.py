@@ -203,10 +203,9 @@ def _legend(figure: Figure, scene: Scene) -> None:
     names = [*scene.labels, *["no annotation"] * (256 - len(scene.labels))]
     entries = [(f"{names[k]}  {share[k]:.1%}", MATERIAL_COLOURS[int(k)]) for k in present]
     columns = 4 if scene.deformed is None else 3  # The fourth is above the scale.
-    end = _LEFT + columns * (PANEL + _GAP) - _GAP
-    box = _LEFT, y, end - 190
+    canvas.note(figure, _LEFT, y, "share of the SLAT voxels:", 6.8)
+    box = _LEFT + 190, y, _LEFT + columns * (PANEL + _GAP) - _GAP
     canvas.draw_legend(figure, entries, box, edgecolor=canvas.MUTED, linewidth=0.5)
-    canvas.note(figure, end, y, "share of the SLAT voxels", 6.8, ha="right")
     if scene.deformed is not None:
         _scale(figure, scene.displacement_scale, _LEFT + 3 * (PANEL + _GAP), y)
 
@@ -259,11 +258,13 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y
 def _histogram(figure: Figure, scene: Scene, radius: float, left: float, y: float) -> None:
     """Draw the histogram of errors, and as a line that of the errors before."""
     share = float((scene.error <= radius).mean())
-    before = "before" if scene.deformed is None else "undeformed"
+    heading, before = "error per SLAT surface voxel", "before"
+    if scene.deformed is not None:
+        heading, before = "error per voxel after the deformation", "before it"
     words = (
         f"median {np.median(scene.error):.2f} voxel, {share:.1%} within {radius:g}; line: {before}"
     )
-    axes = _plot(figure, left, y, "error per SLAT surface voxel", words)
+    axes = _plot(figure, left, y, heading, words)
     edges = np.linspace(0, FARTHEST, 31)
     middles = (edges[:-1] + edges[1:]) / 2
     shares = [
