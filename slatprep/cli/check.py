@@ -96,8 +96,8 @@ def check_alignment(
             pictures, sheet = write_pictures(opened, checks, target, jobs=jobs, progress=progress)
 
     measured = measured_errors(opened.path)
-    if measured and measured.build != opened.about.manifest:
-        measured = None  # It is of before an update.
+    if measured and not (measured.tells and measured.build == opened.about.manifest):
+        measured = None  # It tells nothing of an asset, or is of before an update.
     assets = []
     for one, file in zip_longest(checks, pictures):
         figures = [
@@ -295,12 +295,14 @@ def _document(found: MeasuredErrors) -> dict[str, object]:
              "good_wrong", "good_wrong_range", "errors")  # fmt: skip
     kept = {f"{kept.rate:g}": kept.assets for kept in found.kept}
     own = {name: getattr(found, name) for name in names}
-    return own | {"decoys": len(found.decoys), "kept": kept}
+    return own | {"tells": found.tells, "decoys": len(found.decoys), "kept": kept}
 
 
 def _show_errors(output: Output, found: MeasuredErrors) -> None:
     for sentence in found.sentences():
         output.note(sentence)
+    if not found.tells:
+        return
     output.table(
         "Assets that can be kept, by the share of wrong ones among them",
         ("wrong at most", "assets", "of all"),

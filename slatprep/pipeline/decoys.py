@@ -8,6 +8,7 @@ mostly those of before, and what was measured of them is taken over.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -15,8 +16,8 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError
-from slatprep.judge.verdict import LEAST_TARGETS
+from slatprep.errors import StoreError, amount
+from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.plan import Crew
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Engine, Number, Place, Share, Verdict
@@ -137,29 +138,48 @@ class MeasuredErrors:
     counts: tuple[int, ...]
     decoys: tuple[Decoy, ...]
 
+    @property
+    def passed(self) -> int:
+        """Decoys called good."""
+        return sum(one.verdict == Verdict.GOOD for one in self.decoys)
+
+    @property
+    def alike(self) -> bool:
+        """Whether objects are too much alike for decoys to tell."""
+        return self.passed >= ALIKE * len(self.decoys)
+
+    @property
+    def tells(self) -> bool:
+        """Whether decoys tell how many show another object, and which: there are enough."""
+        return self.refitted and not self.alike
+
     def sentences(self) -> list[str]:
         """Say in words what was measured."""
         low, high = self.good_wrong_range
         shares = self.wrong_share_range
-        passed = sum(one.verdict == Verdict.GOOD for one in self.decoys)
-        if passed >= ALIKE * len(self.decoys):
+        if self.alike:
             return [
                 f"decoys cannot tell how many of the {self.good:,} called good show another "
-                f"object: {passed:,} of {len(self.decoys):,} decoys are called good, too, as "
+                f"object: {self.passed:,} of {len(self.decoys):,} decoys are called good, too, as "
                 "objects of this dataset are alike"
             ]
-        told = [
+        if not self.tells:
+            return [
+                f"{amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')} are too "
+                f"few to tell how many show another object; it takes {LEAST_DECOYS} and "
+                f"{LEAST_TARGETS}",
+                f"likely at most {math.ceil(high):,} of the {self.good:,} called good show another "
+                f"object, and {shares[1]:.1%} of all assets",
+            ]
+        return [
             f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "
             f"({low:.0f} to {high:.0f}; measured on {len(self.decoys):,} decoys of this dataset)",
             f"of all {self.assets:,} assets about {self.wrong_share:.1%} show another object "
             f"({shares[0]:.1%} to {shares[1]:.1%})",
         ]
-        if not self.refitted:
-            told.append("too few assets or decoys to learn from: the shipped model stands")
-        return told
 
     def of_asset(self, asset_id: str) -> str:
-        """Say how probable it is that an asset shows another object, where decoys can tell."""
+        """Say how probable it is that an asset shows another object; only where this `tells`."""
         error = self.errors.get(asset_id)
         likely = f"below {LEAST_TOLD:.1%}" if error is None else f"{error:.1%}"
         return f"by the decoys of its dataset, the probability of another object is {likely}"

@@ -62,9 +62,15 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
     found = measure_errors(store, decoys=3, seed=1)
     assert "3 of 3 decoys are called good, too" in found.sentences()[0], "all are the same L"
     others = tuple(replace(one, verdict="failed") for one in found.decoys)
-    told = replace(found, decoys=others).sentences()
-    assert "decoys of this dataset" in told[0]
-    assert told[-1].startswith("too few assets")
+    few = replace(found, decoys=others, good=4, good_wrong=0.1, good_wrong_range=(0.0, 0.3))
+    assert few.sentences() == [
+        "3 decoys of 5 assets are too few to tell how many show another object; it takes 40 and 50",
+        f"likely at most 1 of the 4 called good show another object, "
+        f"and {found.wrong_share_range[1]:.1%} of all assets",
+    ]
+    enough = replace(few, refitted=True)
+    assert "about 0 show another object (0 to 0; measured on 3 decoys" in enough.sentences()[0]
+    assert enough.tells and not few.tells and not replace(found, refitted=True).tells
     picture = draw_errors(found, store.name)
     assert picture.startswith(b"\x89PNG")
     assert picture == draw_errors(found, store.name)
@@ -81,8 +87,16 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     shown = run("info", store.path)
     assert all(sentence in shown.output for sentence in measured.sentences())
     words = ("check-alignment", "--asset", asset_id, "--store", store.path, "--picture", "none")
-    assert measured.of_asset(asset_id) in run(*words).output
-    (found,) = json.loads(run(*words, "--json").stdout)["assets"]
+    assert "the probability of another object" not in run(*words).output
+    assert "another_object" not in json.loads(run(*words, "--json").stdout)["assets"][0]
+    told = run("measure-errors", store.path, *options).output
+    assert "Assets that can be kept" not in told and "Most likely another" not in told
+    others = tuple(replace(one, verdict="failed") for one in measured.decoys)
+    telling = replace(measured, decoys=others, refitted=True)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(decoys, "measured_errors", lambda _: telling)
+        assert telling.of_asset(asset_id) in run(*words).output
+        (found,) = json.loads(run(*words, "--json").stdout)["assets"]
     assert found["another_object"] == measured.errors.get(asset_id, 0.0)
     assert "is below 0.1%" in replace(measured, errors={}).of_asset(asset_id)
     assert "is 25.0%" in replace(measured, errors={asset_id: 0.25}).of_asset(asset_id)

@@ -166,7 +166,7 @@ def draw_errors(errors: MeasuredErrors, name: str, kind: str = "png") -> bytes:
         axes.step(edges, [*counts, counts[-1]], where="post", lw=1.6, label=decoys,
                   color=canvas.VERDICT_COLOURS["failed"])  # fmt: skip
         for kept in errors.kept:
-            if kept.rate in RATES and kept.assets:
+            if errors.tells and kept.rate in RATES and kept.assets:
                 axes.axvline(kept.score, color=canvas.INK, lw=1, ls=RATES[kept.rate],
                              label=f"{kept.assets:,} kept at {kept.rate:.0%} wrong")  # fmt: skip
         ticks = np.array([1e-4, 0.01, 0.5, 0.99, 0.9999])

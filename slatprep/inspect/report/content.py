@@ -197,7 +197,10 @@ def _errors(store: Store) -> dict[str, Any]:
         "edges": [round(edge, DIGITS) for edge in measured.edges],
         "assets": measured.targets,
         "decoys": measured.counts,
-        "kept": [(one.rate, one.assets, rounded(one.score)) for one in measured.kept],
+        "kept": [
+            (one.rate, one.assets, rounded(one.score if measured.tells else None))
+            for one in measured.kept
+        ],
     }
 
 
