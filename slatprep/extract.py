@@ -85,8 +85,7 @@ def load_session(
     """Load TRELLIS's image pipeline; by default on the GPU if there is one.
 
     `model` is a repository or a folder of its files, `revision` a commit, tag or branch of the
-    repository. SlatprepError if TRELLIS is not installed, ConfigError if a folder is given a
-    revision.
+    repository. ConfigError if TRELLIS is not installed, or a folder is given a revision.
     """
     with redirect_stdout(sys.stderr):  # TRELLIS prints which kernels it takes when imported.
         try:

@@ -94,7 +94,7 @@ def accumulate(here, there, link, centre, tau, weight, unknowns, equations):  # 
 def fit_of(here, there, link, equations):  # type: ignore[no-untyped-def]
     """Of one side at tau = 1, the summed kernel, and the number and squares of the inliers.
 
-    Of the equations the memory is used.
+    `equations` only lends its memory.
     """
     block = equations.block
     kernels, inliers, sum_of_squares = 0.0, 0, 0.0

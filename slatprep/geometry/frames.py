@@ -1,4 +1,4 @@
-"""Frames, voxels, boundaries and transforms.
+"""Frames, voxels and transforms.
 
 Both frames are the unit cube [-0.5, 0.5]^3 with voxel ``i`` centred at
 ``(i + 0.5) / 64 - 0.5`` on each axis. Transforms are 4x4 homogeneous matrices

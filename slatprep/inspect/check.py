@@ -147,7 +147,7 @@ class AlignmentCheck:
 def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     """Recompute an alignment's quality, and the annotation it gives, from the store alone.
 
-    Raises StoreError if the store has no such asset, or lacks its build parameters.
+    Raises StoreError if the store has no such asset.
     """
     store = open_store(store)
     asset = store.asset(name)
@@ -213,8 +213,7 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     NaN counts as a difference.
 
     The stored grid is a single annotation. Labels merged from several are compared only where all
-    agree, or where only the stored one has a label. StoreError if the store lacks its build
-    parameters.
+    agree, or where only the stored one has a label.
     """
     parameters = asset.store.about.build.parameters.sample
     # What is looked up is copied, so it need not be brought to SI units and back.

@@ -84,14 +84,14 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class LatentModel:
-    """Gaussians of latents (8 channels) by class, with one precision, and the classes' shares."""
+    """Gaussians of latents by class, with one precision, and the classes' shares."""
 
     means: Array
     precision: Array
     shares: Array
 
     def log_likelihood(self, feats: NDArray[np.float32]) -> Array:
-        """Return the log likelihood (N, 7) of latents (N, 8) by class, but for a term of each row.
+        """Return the log likelihood (N, K) of latents (N, C) by class, but for a term of each row.
 
         That term, -z P z / 2, is the same for all classes, and only differences count.
         """
@@ -169,7 +169,7 @@ def fold_of(object_id: str) -> int:
 def moments_of(
     feats: NDArray[np.float32], material: NDArray[np.uint8], labels: int = BACKGROUND
 ) -> Moments:
-    """Return the moments of one asset from its latents (N, 8) and classes (N,) below `labels`."""
+    """Return the moments of one asset from its latents (N, C) and classes (N,) below `labels`."""
     known = material < labels
     z, classes = feats[known].astype(np.float64), material[known]
     one = 1.0 / max(len(z), 1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.learn.decoder import PhysicsDecoder, make_decoder
-from slatprep.learn.runs import read_state
+from slatprep.learn.runs import BEST, read_state
 from slatprep.normalize import denormalize_properties, normalization_of
 from slatprep.readers.files import refusing
 from slatprep.records import (
@@ -105,7 +105,7 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
     Raises InputError if the file is no such checkpoint, or is too old to have ranges.
     """
     if path.is_dir():
-        path = path / "best.pt"
+        path = path / BEST
     if not path.is_file():
         raise InputError(path, "does not exist", "best.pt, which a training writes with its epochs")
     state = read_state(path)

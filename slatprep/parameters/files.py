@@ -1,8 +1,8 @@
 """Dataset definitions: a TOML file and options become `BuildParameters`.
 
 The file has a table for each group of `slatprep.parameters`. Its relative paths start from its own
-folder. Options win over the file, and a preset replaces the whole ``align`` and ``sample`` groups
-of the file.
+folder. Options win over the file, and a preset replaces whole groups
+of the file: ``align`` and ``sample``, and the preset ``paper`` also ``normalize``.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def load_parameters(
         relative to the working directory.
     preset : str, optional
         One of `slatprep.parameters.PRESETS`. It replaces the align
-        and sample groups of the file, and `overrides` win over it.
+        and sample groups of the file (``paper`` also normalize), and `overrides` win over it.
 
     Returns
     -------

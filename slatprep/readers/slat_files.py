@@ -9,7 +9,7 @@ from urllib.parse import quote
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers.adapters import latent_adapter
-from slatprep.readers.hdf5 import SUFFIXES
+from slatprep.readers.hdf5 import SUFFIXES, find_groups
 from slatprep.readers.patterns import find_files, held_names, list_below, tried_names
 from slatprep.records import Place
 from slatprep.records.encoders import LATENTS
@@ -164,8 +164,6 @@ def _each_group(
     source: SlatSource, root: Place, path: str, known: Mapping[str, str] | None = None
 ) -> Iterator[NamedSlat]:
     """Return the SLATs that lie as groups in one HDF5 file."""
-    from slatprep.readers.hdf5 import find_groups
-
     if "{id}" not in source.group:
         raise ConfigError(f"group pattern {source.group!r} names no {{id}}")
     try:

@@ -97,8 +97,8 @@ def require_prediction(
 ) -> list[str]:
     """Hold normalised values (K, 3) and classes (K,) against what a network predicts.
 
-    It may leave [-1, 1], but not in most voxels; see `require_plausible`, which this is alike.
-    Without a setting for `plausibility`, values that are none are refused.
+    It may leave [-1, 1], but not in most voxels; otherwise like `require_plausible`.
+    Without a setting for `plausibility`, such values are refused.
     """
     if plausibility == "off" or len(values) == 0:
         return []

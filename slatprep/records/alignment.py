@@ -262,7 +262,8 @@ class FitFigures:
         another engine placed it.
     clear_by : float
         By how many standard errors it fits better, on the same samples, than any placement that
-        scores less than 0.03 below it; NaN where there is none, or where another engine placed it.
+        scores less than 0.03 below it (0.06 where it is contested); NaN where there is none, or
+        where another engine placed it.
     agreement : Agreement or None
         How evenly the surfaces lie on each other; None where it was not measured.
     """

@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import cached_property
-from typing import IO, TYPE_CHECKING, Self
+from typing import IO, Self
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.storage.archives import Archive, Index, shown
@@ -15,9 +15,6 @@ from slatprep.storage.files import RemoteListing
 from slatprep.storage.remote import PlaceByText, RemotePlace
 from slatprep.storage.states import Noted
 from slatprep.storage.tar import BLOCK, MAX_KEPT, Entry
-
-if TYPE_CHECKING:
-    pass
 
 _AT_ONCE = 8
 """Archives that are read at the same time."""

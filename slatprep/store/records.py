@@ -125,7 +125,7 @@ def manifests_of(store: Place) -> Place:
 def manifests_beside(store: Place) -> Place | None:
     """Return the folder of a store's records if there is one; StoreError if nobody can tell."""
     folder = manifests_of(store)
-    files = (folder / "build.json", folder / "assets.jsonl")
+    files = (folder / BUILD, folder / ASSETS)
     try:
         return folder if any(file.exists() for file in files) else None
     except OSError as error:
