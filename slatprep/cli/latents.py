@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import click
@@ -92,7 +93,7 @@ class LatentsReader:
         how = contents.in_words(moments)
         enough = len(latents.coords) >= contents.ENOUGH
         if enough and not contents.tell_alone(moments, self.space):
-            known = self._moments_of_files()
+            known = self._moments_of_files
             if len(known) < 2:
                 raise InputError(
                     path,
@@ -109,8 +110,9 @@ class LatentsReader:
         )
         return replace(latents, standardised=True)
 
+    @cached_property
     def _moments_of_files(self) -> list[tuple[int, LatentMoments]]:
-        """Return voxels and moments of the first files that can be read."""
+        """Voxels and moments of the first files that can be read."""
         from slatprep.readers.slat import read_slat
 
         known = []
