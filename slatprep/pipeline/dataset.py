@@ -17,7 +17,7 @@ from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.before import SHARE, Before, look_back
 from slatprep.pipeline.decoys import DECOYS, measure_build
-from slatprep.pipeline.notices import dataset_notices
+from slatprep.pipeline.notices import dataset_notices, much_clipped
 from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.plan import (
     Action,
@@ -314,7 +314,7 @@ def _publish(
             "they did; all sources were hashed"
         )
     if new and records is not None:
-        warnings += dataset_notices(new, parameters, failed)
+        warnings += [*dataset_notices(new, parameters, failed), *much_clipped(store)]
     damaged = [f"{row.asset_id}: {row.damaged}" for row in rows if row.damaged]
     summary = publish_store(
         place,

@@ -17,6 +17,7 @@ from slatprep.pipeline.rows import NextStore, Row, moments_of
 from slatprep.readers.contents import ENOUGH, in_words, look_standardised, pooled_moments
 from slatprep.readers.joins import explain_unmatched
 from slatprep.records import AssetPair, Normalization, Verdict
+from slatprep.store import Store
 from slatprep.store.record import FailedRecord
 
 # What the range would be without an asset: narrower by decades, or by its own widths.
@@ -29,6 +30,9 @@ _NAMED = 3
 
 _LOOKS = re.compile(r"the values look like (.+?)(?: \(or |: )")
 """What refused values look like, in the words of `slatprep.readers.values`."""
+
+_MOST_CLIPPED = 0.25
+"""Share of values beyond a range; percentiles that people ask for leave out a tenth or a fifth."""
 
 
 def nothing_usable(
@@ -61,6 +65,20 @@ def dataset_notices(
     yield from shared_sources(new)
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
         yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
+
+
+def much_clipped(store: Store) -> Iterator[str]:
+    """Yield which ranges cut off many of the values of a store."""
+    valid = float((store.column("valid_share") * np.diff(store.offsets)).sum())
+    counts = store.column("clipped").sum(axis=0).tolist()
+    for span, count in zip(store.normalization.ranges, counts, strict=True):
+        if count > _MOST_CLIPPED * valid:
+            unit = ", in log10 of the SI value," if span.log10 else ""
+            yield (
+                f"{count / valid:.0%} of the values of {span.name} are beyond its range{unit} "
+                f"{span.lo:.4g} to {span.hi:.4g}, and were set to the end of it: see "
+                "normalize.ranges"
+            )
 
 
 def unusual_values(rows: Sequence[Row], failed: Sequence[FailedRecord] = ()) -> Iterator[str]:

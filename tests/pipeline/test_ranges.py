@@ -132,3 +132,17 @@ def test_lists_that_cannot_be_used_are_named(make_dataset, tmp_path, steps, text
     with pytest.raises(error, match=message):
         build_store(chosen, out)
     assert not steps and not out.exists()
+
+
+def test_a_range_that_cuts_off_most_values_is_told(make_dataset, tmp_path):
+    dataset, file = make_dataset("a"), tmp_path / "si.toml"
+    file.write_text(
+        "[youngs_modulus]\nlo = 1e4\nhi = 1e6\n[density]\nlo = 0.0\nhi = 9.0\n"
+        "[poissons_ratio]\nlo = 0.0\nhi = 0.5\n"
+    )
+    summary = build_store(of(dataset, ranges=str(file)), tmp_path / "s.zarr")
+    (told,) = [one for one in summary.warnings if "beyond its range" in one]
+    assert told == (
+        "100% of the values of youngs_modulus are beyond its range, in log10 of the SI value, "
+        "1e+04 to 1e+06, and were set to the end of it: see normalize.ranges"
+    )
