@@ -89,8 +89,11 @@ lint: $(VENV)/.installed-dev
 
 # A process of tests is one of $(JOBS): a library's threads would wait for each other's cores.
 # worksteal leaves no core idle at the end, and tests of one file mostly to one process.
-TESTS = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+TESTS = $(IN_MEMORY) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
         $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+# Tests write a thousand stores. A disk takes a third of their time, memory none, where it has room.
+IN_MEMORY = $(shell df -Pk /dev/shm 2>/dev/null | \
+              awk 'END { if ($$4 > 8000000) print "TMPDIR=/dev/shm" }')
 # Once, or each process of the tests would compile the same.
 KERNELS = $(BIN)/python -c \
           'from slatprep.pipeline.asset import compile_kernels; compile_kernels()'
