@@ -25,6 +25,7 @@ from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange
 from slatprep.storage.place import storage_of
+from slatprep.storage.versions import is_version
 from slatprep.store import open_store
 from slatprep.store.record_json import adapter_of
 from slatprep.store.records import build_in, manifests_beside
@@ -191,8 +192,9 @@ def _require_unclipped(new: NextStore) -> None:
 
 
 def _same_place(one: Place, other: Place) -> bool:
-    """Whether two places are one, whatever leads there."""
+    """Whether a store or a version of it lies at another place, whatever leads there."""
     a, b = storage_of(one).local, storage_of(other).local
+    one = one.parent.parent if is_version(one) else one
     return one == other if a is None or b is None else a.resolve() == b.resolve()
 
 

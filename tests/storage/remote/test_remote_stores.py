@@ -20,11 +20,12 @@ from support.faulty_proxy import Faults, faulty
 from support.remote import current, put, raising, versions
 from support.trees import contents, tree
 
-from slatprep.errors import StoreError
+from slatprep.errors import ConfigError, StoreError
 from slatprep.inspect.overview import overview_of
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.join import subset_store
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer
@@ -48,6 +49,16 @@ def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
     assert (group["voxel/coords"][:] == zarr.open_group(expected)["voxel/coords"][:]).all()
     assert verify_store(url, sources=True).findings == ()
     assert not any((tmp_path / "cache").rglob("*.arrays"))
+
+
+def test_a_source_is_never_replaced_on_s3_either(s3, url, undisturbed):
+    put(undisturbed[1], url)
+    before = versions(s3, url)
+    for source in (url, str(open_store(url).path)):
+        with pytest.raises(ConfigError, match="is a store to take assets from"):
+            subset_store(source, url, ["a"])
+    assert versions(s3, url) == before
+    assert subset_store(url, f"{url}.zarr", ["a"]).complete
 
 
 def assert_same(left: Store, right: Store) -> None:
