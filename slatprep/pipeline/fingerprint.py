@@ -43,15 +43,18 @@ _DECODING = ("slatprep.storage.chunks",)
 PACKING = (
     "slatprep.normalize",
     "slatprep.pipeline.pack",
+    "slatprep.pipeline.passes",
     "slatprep.pipeline.recipe",
     "slatprep.pipeline.rows",
+    "slatprep.pipeline.settle",
     "slatprep.pipeline.spool",
+    "slatprep.store.attributes",
     "slatprep.store.layout",
     "slatprep.store.record_json",
     "slatprep.store.shard_writer",
     "slatprep.store.writer",
 )
-"""What makes rows, columns and records of an asset's numbers; these modules alone."""
+"""What makes ranges, settles ties, and packs rows, columns and records; these modules alone."""
 
 
 @lru_cache(maxsize=1)

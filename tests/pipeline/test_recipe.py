@@ -155,7 +155,8 @@ def test_what_makes_numbers_is_in_it_and_nothing_else():
 def test_what_packs_rows_makes_columns_and_records_is_in_the_other(monkeypatch, tmp_path):
     """Code that is in no key, and still decides bytes."""
     wanted = {"normalize", "pipeline.pack", "pipeline.recipe", "store.record_json",
-              "store.shard_writer", "store.layout"}  # fmt: skip
+              "store.shard_writer", "store.layout", "store.attributes", "pipeline.settle",
+              "pipeline.passes"}  # fmt: skip
     assert {f"slatprep.{name}" for name in wanted} <= set(fingerprint.PACKING)
     before = fingerprint.packing_fingerprint.__wrapped__()
     source = fingerprint._source
