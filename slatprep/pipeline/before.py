@@ -23,8 +23,8 @@ from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.recipe import Recipe, Wanted
 from slatprep.pipeline.rows import NextStore, Row, SourceStore, checked_store
 from slatprep.pipeline.seen import bound_to, look, read_seen, write_seen
-from slatprep.readers import hash_sources
-from slatprep.records import AssetPair, Place
+from slatprep.readers import hash_sources, reading_of
+from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.place import storage_of
 from slatprep.storage.states import is_settled, settle
 from slatprep.store import Store, open_store
@@ -120,9 +120,13 @@ class Before:
 
     def _bound_to(self, store: Store) -> bytes:
         """Return what states hold for: this machine, a build's store, and how it was read."""
-        wanted, own = self.wanted, self.wanted.parameters.pixieverse
-        slat, also = wanted.parameters.slat, wanted.parameters.also
-        read = (wanted.declared, slat, also, own.units, own.plausibility)
+        wanted, also = self.wanted, self.wanted.parameters.also
+        slat, held = wanted.parameters.slat, wanted.declared
+        roots = (
+            SourceRoots(one.root, slat.root, held, one.adapter, 0, (), one.units, one.plausibility)
+            for one in (wanted.parameters.pixieverse, *also)
+        )
+        read = held, slat, also, [reading_of(one) for one in roots]
         return bound_to(store.about.manifest, wanted.recipe.key("", {"": str(read)}))
 
     def _is_as_left(self, previous: SourceStore, state: bytes) -> bool:

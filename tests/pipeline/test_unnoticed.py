@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from support.faults import inject
 from support.first_builds import tree_from_nothing
+from support.installed import package
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
+from slatprep import readers
 from slatprep.pipeline import before, plan, seen
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import AssetPair, SourceRoots
@@ -138,6 +140,23 @@ def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
     assert len(hashed) == 1
     built(dataset, tmp_path, rehash=True)
     assert len(hashed) == 3
+
+
+def test_an_adapter_of_another_version_is_no_change_of_the_sources(
+    tmp_path, monkeypatch, files_are_old
+):
+    dataset, out = Dataset(tmp_path / "d").having("a", "b"), tmp_path / "s.zarr"
+    code = {"mine": "from slatprep.readers.pixieverse import PixieVerse"}
+    points = "[slatprep.sources]\nmine = mine:PixieVerse\n"
+    with package(tmp_path / "site", "theirs", code, points, monkeypatch):
+        parameters = dataset.parameters(pixieverse={"adapter": "mine"})
+        first = build_store(parameters, out)
+        monkeypatch.setattr(readers, "made_by", lambda group, name: "theirs 2.0")
+        second = build_store(parameters, out)
+        assert second.build_id != first.build_id
+        assert not [text for text in second.warnings if "look as they did" in text]
+        monkeypatch.setattr(readers, "made_by", lambda group, name: "theirs 3.0")
+        assert build_store(parameters, out, rehash=0).build_id != second.build_id
 
 
 def test_nothing_is_seen_of_an_asset_whose_reader_reads_what_is_not_known():
