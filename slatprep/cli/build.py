@@ -185,7 +185,13 @@ def build_store(
         if dry_run:
             with output.progress("compare") as progress:
                 plan = build.plan_build(
-                    parameters, out, jobs=jobs, fresh=fresh, rehash=rehash == 1, progress=progress
+                    parameters,
+                    out,
+                    manifests=manifests,
+                    jobs=jobs,
+                    fresh=fresh,
+                    rehash=rehash == 1,
+                    progress=progress,
                 )
             _show_plan(output, plan)
             return

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,7 +134,7 @@ def build_store(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
-    if not hasattr(parameters, "pixieverse"):
+    if not isinstance(parameters, BuildParameters):
         raise ConfigError(f"parameters are {parameters!r:.80}; expected those of load_parameters")
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
@@ -149,7 +150,7 @@ def build_store(
     ):
         pairs = _discover(parameters, jobs, work.shared(), note=note)
         before = look_back(place, pairs, wanted, crew, fresh, rehash, rehash_seed)
-        if before.suffices:
+        if before.suffices and not keep_work:
             return _publish(before, begin)
         before.check(crew.of(len(pairs)))
         context = BuildContext(parameters, wanted.recipe, work.spool, before.previous, strict)
@@ -164,7 +165,11 @@ def build_store(
             work.keep_only({row.key for row in new.rows if row.spooled})
         if records is not None:
             aligned = sum(plan[one].action is not Action.REUSE for one in new.ids)
-            measure_build(open_store(place.in_place()), aligned, decoys, crew, before.previous)
+            try:
+                measure_build(open_store(place.in_place()), aligned, decoys, crew, before.previous)
+            except Exception as error:  # The store is published, and stays so.
+                told = f"errors were not measured ({error}); run `slatprep measure-errors`"
+                summary = replace(summary, warnings=(*summary.warnings, told))
     return summary
 
 
@@ -219,13 +224,15 @@ def plan_build(
     parameters: BuildParameters,
     out: str | Place,
     *,
+    manifests: str | Place | None = None,
     jobs: Jobs = 1,
     fresh: bool = False,
     rehash: bool = False,
     progress: Progress | None = None,
 ) -> BuildPlan:
     """Say what `build_store` would do with each asset, and why; nothing is written."""
-    place, wanted, crew = Destination(out), Wanted.of(parameters), Crew(jobs, progress=progress)
+    place, wanted = Destination(out, manifests), Wanted.of(parameters)
+    crew = Crew(jobs, progress=progress)
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:
         spool = Spool(work_directory(place.store) / "nothing")

@@ -16,7 +16,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError, amount
+from slatprep.errors import SlatprepError, StoreError, amount
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.plan import Crew
 from slatprep.pipeline.rows import SourceStore
@@ -224,6 +224,8 @@ def measure_errors(
     StoreError
         If the store has fewer than two objects, its transforms were given, or its records have
         no evidence.
+    SlatprepError
+        If a decoy kills its worker even alone.
     """
     from slatprep.judge.decoys import error_rates
 
@@ -239,7 +241,7 @@ def measure_errors(
     tasks = (
         (store.path, k, wanted[k], records.read(row_of[wanted[k].grid]).parameters) for k in missing
     )
-    for done, (number, decoy) in enumerate(run_unordered(align_decoy, tasks, jobs), 1):
+    for done, (number, decoy) in enumerate(run_unordered(align_decoy, tasks, jobs, fail_decoy), 1):
         found[number] = decoy
         if progress:
             progress(done, len(missing))
@@ -368,6 +370,16 @@ def align_decoy(
     alignment = align(field, latents, parameters.align)
     _, judgement = look_up(field, latents, alignment, parameters.sample)
     return number, replace(decoy, verdict=str(judgement.verdict), evidence=judgement.evidence)
+
+
+def fail_decoy(
+    path: Place, number: int, decoy: Decoy, parameters: StageParameters
+) -> tuple[int, Decoy]:
+    """Raise for a decoy that killed its worker twice, the second time alone in it."""
+    raise SlatprepError(
+        f"{path}: the decoy of {decoy.grid} with the SLAT of {decoy.slat} killed its worker "
+        "process twice, probably because memory ran out"
+    )
 
 
 def measured_errors(store: Place) -> MeasuredErrors | None:

@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -135,6 +137,25 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, t
     assert tree(one) == tree(two) == tree(none)
     assert not (manifests_of(none) / FILE).exists()
     assert told_of(open_store(none))[0].startswith("not measured; run")
+
+
+@pytest.mark.usefixtures("few_suffice")
+@pytest.mark.parametrize("fault", ["raised", "killed"])
+def test_a_decoy_that_cannot_be_aligned_costs_no_build(make_dataset, tmp_path, monkeypatch, fault):
+    def raising(*task: object) -> None:
+        raise ValueError("singular")
+
+    def killing(function: object, tasks: Iterable[tuple[Any, ...]], jobs: object, died: Any) -> Any:
+        return (died(*task) for task in tasks)
+
+    names = {"raised": ("align_decoy", raising), "killed": ("run_unordered", killing)}
+    monkeypatch.setattr(decoys, *names[fault])
+    summary = build_store(make_dataset(*OBJECTS).parameters(), tmp_path / "s.zarr")
+    assert summary.complete
+    assert summary.warnings[-1].startswith("errors were not measured")
+    said = {"raised": "singular", "killed": "killed its worker process"}
+    assert said[fault] in summary.warnings[-1]
+    assert "replaced" not in summary.warnings[-1]
 
 
 @pytest.mark.usefixtures("few_suffice", "few_are_new")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from support.first_builds import tree_from_nothing
 from support.synthetic import make_asset
 from support.trees import inodes, tree
 
+from slatprep.errors import StoreError
 from slatprep.parameters import AlignParameters, BuildParameters
 from slatprep.pipeline import recipe
 from slatprep.pipeline.dataset import build_store, plan_build
@@ -151,6 +153,30 @@ def test_kept_work_is_used_and_holds_no_more_than_the_store(built, aligned, monk
     assert open_store(out).ids == ["a", "b"]
     assert len(list(kept.rglob("*.arrays"))) == 2
     assert aligned == read == []
+
+
+def test_work_is_kept_of_a_store_that_is_as_it_was_left(built, aligned):
+    dataset, out = built
+    build_store(dataset.parameters(), out)
+    before = tree(out)
+    build_store(dataset.parameters(), out, keep_work=True)
+    assert len(list((out.with_name(".s.zarr.work") / "spool").rglob("*.arrays"))) == 3
+    assert aligned == []
+    assert tree(out) == before
+
+
+def test_a_dry_run_looks_where_the_build_does(built, tmp_path):
+    dataset, out = built
+    shutil.copytree(out, tmp_path / "s")
+    with pytest.raises(StoreError, match="expected --manifests FOLDER"):
+        plan_build(dataset.parameters(), tmp_path / "s")
+    own = tmp_path / "records"
+    plan = plan_build(dataset.parameters(), tmp_path / "s", manifests=own)
+    assert plan.actions["reuse"] == 3
+    sides = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
+    words = ("build-store", *sides, "--out", tmp_path / "s", "--manifests", own, "--dry-run")
+    assert "3 to reuse" in run(*words).output
+    assert not own.exists()
 
 
 def test_a_dry_run_writes_nothing(built):
