@@ -1,6 +1,6 @@
 """What is left of a search: refined, deformed where that is earned, and compared once more.
 
-Steps 4 and 6 of docs/method.md.
+Steps 4 and 6 of docs/design/alignment.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How good an alignment is: figures at a tight radius, and a verdict in one word."""
+"""How good an alignment is: figures at a tight radius."""
 
 from __future__ import annotations
 

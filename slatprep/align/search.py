@@ -1,4 +1,7 @@
-"""The search of all orientations, and of shapes that differ; steps 3 and 5 of docs/method.md."""
+"""The search of all orientations, and of shapes that differ.
+
+Steps 3 and 5 of docs/design/alignment.md.
+"""
 
 from __future__ import annotations
 

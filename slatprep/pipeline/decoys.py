@@ -44,7 +44,7 @@ RATES = (0.001, 0.01, 0.05)
 """Shares of wrong assets for which it is said how many assets may be kept."""
 
 FILE = "decoys.json"
-"""In the folder of the store's records, as it is called beside the store."""
+"""In the folder of the store's records, as that is called beside the store; see `file_of`."""
 
 LEAST_TOLD = 0.001
 """Least probability of an error that is kept for an asset."""
@@ -217,7 +217,7 @@ def measure_errors(
     Returns
     -------
     MeasuredErrors
-        Also written to `FILE`.
+        Also written to `file_of` the store.
 
     Raises
     ------
@@ -382,10 +382,18 @@ def fail_decoy(
     )
 
 
+def file_of(store: Place) -> Place:
+    """Return where a store's errors are kept; ``demo`` and ``demo.zarr`` have one folder."""
+    local = storage_of(store).local
+    name = "" if local is None else local.resolve().name
+    own = name and not name.endswith(".zarr")
+    return manifests_of(store) / (f"{name}.{FILE}" if own else FILE)
+
+
 def measured_errors(store: Place) -> MeasuredErrors | None:
     """Return what was measured of a store, or of what it was before an update; None if nothing."""
     try:
-        text = read_bounded(manifests_of(store) / FILE, _MAX_BYTES)
+        text = read_bounded(file_of(store), _MAX_BYTES)
         found: MeasuredErrors = adapter_of(MeasuredErrors).validate_json(text, strict=True)
     except (OSError, ValueError):
         return None  # They are measured anew.
@@ -409,6 +417,6 @@ def told_of(store: Store) -> list[str]:
 
 def _write(store: Store, measured: MeasuredErrors) -> None:
     """Write what was measured beside the store."""
-    file = manifests_of(store.path) / FILE
+    file = file_of(store.path)
     with writing(str(file), file.parent), storage_of(file).staged() as path:
         path.write_bytes(orjson.dumps(measured, option=orjson.OPT_INDENT_2) + b"\n")

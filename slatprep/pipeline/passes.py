@@ -74,7 +74,8 @@ class Reopened:
 def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> list[Row]:
     """Give ambiguous assets the placement nearest to the dataset's common rotation.
 
-    The order stays; rows without a tie are the same objects.
+    The order stays. Rows whose placement stands are the same objects: those without a tie that
+    share the rotation, and all others that neither their tie nor their heading changes.
     """
     tied = [asset for asset in assets if asset.columns["n_placements"]]
     others = [asset for asset in assets if not asset.columns["n_placements"]]

@@ -36,8 +36,8 @@ _UNKNOWN = bytes(_STATE)
 def read_seen(folder: Path, bound: bytes) -> tuple[dict[bytes, str], bytes]:
     """Read what the last build saw; nothing where no whole file is bound to the same.
 
-    That are the keys of the assets of the store by the state of their sources, and the state of the
-    store's files and records when it was finished; empty if unknown.
+    Returns the key of each of the store's assets by the state of its sources, and the state of the
+    store's files and records when it was finished; 32 zeros if that state was not known.
     """
     try:
         with open_regular(folder / NAME) as file:

@@ -140,6 +140,20 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, t
 
 
 @pytest.mark.usefixtures("few_suffice")
+def test_stores_with_one_folder_of_records_keep_their_own_errors(make_dataset, tmp_path):
+    parameters = make_dataset(*OBJECTS).parameters()
+    one, two, link = (tmp_path / name for name in ("demo.zarr", "demo", "link.zarr"))
+    build_store(parameters, one)
+    build_store(replace(parameters, name="two"), two, manifests=tmp_path / "records")
+    link.symlink_to("demo")
+    for store in (one, two, link):
+        measured = measured_errors(store)
+        assert measured is not None
+        assert measured.build == open_store(store).about.manifest
+    assert measured_errors(one) != measured_errors(two)
+
+
+@pytest.mark.usefixtures("few_suffice")
 @pytest.mark.parametrize("fault", ["raised", "killed"])
 def test_a_decoy_that_cannot_be_aligned_costs_no_build(make_dataset, tmp_path, monkeypatch, fault):
     def raising(*task: object) -> None:
