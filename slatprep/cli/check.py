@@ -128,7 +128,10 @@ def check_alignment(
 
 def _target(store: Place, picture: Path | None, assets: int) -> Path | None:
     if picture is None:
-        return options.beside(store, ".pictures")
+        from slatprep.store.reader import require_beside
+
+        require_beside(folder := options.beside(store, ".pictures"))
+        return folder
     if picture == Path("none"):
         return None
     from slatprep.inspect.pictures.canvas import FORMATS

@@ -17,7 +17,7 @@ import numpy as np
 from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.before import SHARE, Before, look_back
-from slatprep.pipeline.decoys import DECOYS, measure_build
+from slatprep.pipeline.decoys import DECOYS, measure_build, writable_file
 from slatprep.pipeline.notices import dataset_notices, much_clipped
 from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.plan import (
@@ -138,6 +138,8 @@ def build_store(
         raise ConfigError(f"parameters are {parameters!r:.80}; expected those of load_parameters")
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
+    if decoys:
+        writable_file(place.store)
     with (
         place.telling_if_stopped(),
         work_beside(

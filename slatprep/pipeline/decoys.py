@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -19,12 +20,14 @@ from numpy.typing import NDArray
 from slatprep.errors import SlatprepError, StoreError, amount
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.plan import Crew
+from slatprep.pipeline.publish import is_marked
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Engine, Number, Place, Share, Verdict
 from slatprep.storage.atomic import writing
 from slatprep.storage.documents import read_bounded
 from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
+from slatprep.store.reader import require_beside
 from slatprep.store.record import StageParameters
 from slatprep.store.record_json import adapter_of
 from slatprep.store.records import StoredRecords, manifests_of
@@ -231,6 +234,7 @@ def measure_errors(
 
     if reason := _no_decoys(store):
         raise StoreError(f"{store.path}: {reason}")
+    writable_file(store.path)
     keys, evidence = _evidence_of(store)
     wanted = draw_decoys(store, keys, decoys, seed)
     measured = before or measured_errors(store.path)
@@ -415,8 +419,19 @@ def told_of(store: Store) -> list[str]:
     return told
 
 
+def writable_file(store: Place) -> Place:
+    """Return `file_of` a store; raise SlatprepError if what lies there is of other origin."""
+    file = file_of(store)
+    local = storage_of(file).local
+    if local is not None:
+        require_beside(local.parent)
+        if os.path.lexists(local) and not is_marked(local, FILE):
+            raise StoreError(f"{local}: is not slatprep's; expected none: move it away")
+    return file
+
+
 def _write(store: Store, measured: MeasuredErrors) -> None:
     """Write what was measured beside the store."""
-    file = file_of(store.path)
+    file = writable_file(store.path)
     with writing(str(file), file.parent), storage_of(file).staged() as path:
         path.write_bytes(orjson.dumps(measured, option=orjson.OPT_INDENT_2) + b"\n")

@@ -28,7 +28,7 @@ from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import PublishedState, Staged, Upload, published_state, upload_store
-from slatprep.store.reader import Store, is_store, open_store, require_outside
+from slatprep.store.reader import Store, is_store, open_store, require_beside, require_outside
 from slatprep.store.record import BuildCounts, BuildRecord, FailedRecord
 from slatprep.store.record_json import to_json
 from slatprep.store.records import (
@@ -43,7 +43,11 @@ from slatprep.store.records import (
     stale_files,
 )
 
-_MARKS = {BUILD: b'"slatprep-build-record"', ASSETS: b'"slatprep-asset-record"'}
+_MARKS = {
+    BUILD: b'"slatprep-build-record"',
+    ASSETS: b'"slatprep-asset-record"',
+    "decoys.json": b'"refitted"',
+}
 """Files beside a store, and what each says at its beginning."""
 
 _HEAD_BYTES = 4096
@@ -69,6 +73,9 @@ class Destination:
         self.store: Place = self.out if path is None else _replaceable(path)
         if self._manifests is not None:
             _require_records(self._manifests, storage_of(self.store).local)
+        elif path is not None:
+            require_beside(beside := Path(str(manifests_of(path))))
+            _require_records(beside, path)
         if path is not None:
             _require_own(self._manifests or Path(str(manifests_of(path))), path)
         self._before: PublishedState | None = None
@@ -147,19 +154,20 @@ def _require_records(folder: Path, store: Path | None) -> None:
     if store is not None and folder.resolve().is_relative_to(store):
         raise StoreError(f"{folder}: lies in the store; expected a folder outside of it")
     require_outside(folder)
-    there = [name for name in _MARKS if os.path.lexists(folder / name)]
-    # Where one file is damaged, the other identifies the folder.
-    if there and not any(_is_marked(folder / name, _MARKS[name]) for name in there):
+    there = [folder / BUILD] if os.path.lexists(folder / BUILD) else []
+    there += stale_files(folder, ()) if folder.is_dir() else []
+    # Where one file is damaged, another identifies the folder.
+    if there and not any(is_marked(file) for file in there):
         raise StoreError(
-            f"{folder}: holds a {there[0]} that is not slatprep's; expected the records of a "
-            "build, or another folder"
+            f"{folder}: holds a {there[0].name} that is not slatprep's; expected the records of a "
+            "build: move it away, or name another folder with --manifests"
         )
 
 
 def require_records_file(file: Path) -> None:
     """Raise ConfigError if a file to write lies in a store, or holds what is no record."""
     require_outside(file)
-    if os.path.lexists(file) and not _is_marked(file, _MARKS[ASSETS]):
+    if os.path.lexists(file) and not is_marked(file, ASSETS):
         raise ConfigError(
             f"{file} exists and holds no records of slatprep; expected such records to replace, "
             "or a new path"
@@ -187,9 +195,10 @@ def _require_own(folder: Path, store: Path) -> None:
             )
 
 
-def _is_marked(file: Path, mark: bytes) -> bool:
+def is_marked(file: Path, name: str = "") -> bool:
+    """Whether a file says at its beginning that it is what a name, by default its own, means."""
     try:
-        return mark in storage_of(file).read(_HEAD_BYTES)
+        return _MARKS.get(name or file.name, _MARKS[ASSETS]) in storage_of(file).read(_HEAD_BYTES)
     except OSError:
         return False
 
@@ -357,7 +366,7 @@ def _write_manifests(
         _write(folder / BUILD, to_json(record, indent=True) + b"\n")
         reached("manifests published", str(folder))
     if (local := storage_of(folder).local) is not None:
-        for file in stale_files(local, names):
+        for file in filter(is_marked, stale_files(local, names)):
             file.unlink()
 
 

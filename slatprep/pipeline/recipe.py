@@ -22,6 +22,7 @@ import orjson
 
 from slatprep.align import engine_versions
 from slatprep.geometry.voxels import boundary
+from slatprep.normalize import ranges_from_extents
 from slatprep.parameters import BuildParameters, NormalizeParameters, is_split_file, percentiles_of
 from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
 from slatprep.readers import contents_of, source_digests
@@ -143,7 +144,11 @@ class Wanted:
 
     def has_ranges(self, store: Store) -> bool:
         """Whether a store of the right assets has the ranges that are asked for."""
-        return self.ranges in (store.normalization, store.normalization.source)
+        ranges = self.ranges
+        if ranges == "dataset":  # A store that was chosen or joined of others may have theirs.
+            extents = store.column("extent")
+            ranges = ranges_from_extents(extents, ranges, self.declared.properties)
+        return ranges in (store.normalization, store.normalization.source)
 
     def allows(self, store: Store) -> bool:
         """Whether a store of the right assets is the one that is asked for."""

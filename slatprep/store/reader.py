@@ -367,6 +367,16 @@ def require_outside(out: Path) -> None:
         raise ConfigError(f"{out} {where}; expected a path outside of any store")
 
 
+def require_beside(folder: Path) -> None:
+    """Raise unless a folder that nobody named, beside a store, may be written.
+
+    StoreError if it is a link, which anybody may have put there; ConfigError as `require_outside`.
+    """
+    if folder.is_symlink():
+        raise StoreError(f"{folder}: is a link; expected a folder, or no file: move it away")
+    require_outside(folder)
+
+
 def _root_document(path: Place) -> dict[str, Any]:
     """Return the root's ``zarr.json``, empty where it is not a store's.
 

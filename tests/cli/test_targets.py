@@ -95,6 +95,16 @@ def test_neither_a_link_into_a_store_nor_a_device_is_replaced(folder):
     assert Path("/dev/null").is_char_device()
 
 
+def test_pictures_and_errors_beside_a_store_go_through_no_link(folder):
+    (folder / "elsewhere").mkdir()
+    (folder / "s.pictures").symlink_to(folder / "elsewhere")
+    assert "s.pictures: is a link" in run("check-alignment @s.zarr --worst 2", folder, 1).stderr
+    shutil.rmtree(folder / "s.manifests")
+    (folder / "s.manifests").symlink_to(folder / "elsewhere")
+    assert "s.manifests: is a link" in run("measure-errors @s.zarr", folder, 1).stderr
+    assert not list((folder / "elsewhere").iterdir())
+
+
 def test_sources_of_a_dataset_definition_are_not_overwritten(folder):
     definition = folder / "d.toml"
     definition.write_text(

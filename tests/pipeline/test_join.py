@@ -41,6 +41,20 @@ def test_a_subset_is_the_build_of_its_assets(folder, tmp_path):
     assert records_of(tmp_path / "s.manifests" / "assets.jsonl") == built
 
 
+def test_an_update_of_a_subset_has_the_ranges_of_its_own_dataset(make_dataset, tmp_path):
+    dataset, out = make_dataset("a", "b"), tmp_path / "s.zarr"
+    grid = dataset.assets["b"].grid.copy()
+    grid[..., 1] *= 2  # Else all assets have the same ranges.
+    dataset.write_grid("b", grid)
+    build_store(dataset.parameters(), tmp_path / "all.zarr")
+    subset_store(tmp_path / "all.zarr", out, ["a"])
+    assert open_store(out).normalization == open_store(tmp_path / "all.zarr").normalization
+    dataset.remove("b")
+    build_store(dataset.parameters(), out)
+    build_store(dataset.parameters(), tmp_path / "first.zarr")
+    assert tree(out) == tree(tmp_path / "first.zarr")
+
+
 def test_joined_stores_are_the_build_of_all_their_assets(folder, tmp_path):
     concat_stores([folder / "bd.zarr", folder / "ac.zarr"], tmp_path / "all.zarr")
     assert tree(tmp_path / "all.zarr") == tree(folder / "abcd.zarr")

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 from support.synthetic import Made
+from support.trees import tree
 
-from slatprep.errors import StoreError
+from slatprep.errors import ConfigError, StoreError
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.join import subset_store
 from slatprep.pipeline.work import work_beside
@@ -209,6 +210,33 @@ def test_a_folder_for_records_that_holds_others_is_refused(undisturbed, tmp_path
             undisturbed[0].parameters(), tmp_path / "s.zarr", manifests=tmp_path / "records"
         )
     assert (tmp_path / "records" / file).read_text() == '{"mine": 1}\n'
+
+
+def test_what_others_have_beside_a_store_is_refused_before_any_work(undisturbed, tmp_path):
+    parameters, out = undisturbed[0].parameters(), tmp_path / "s.zarr"
+    folder, elsewhere = tmp_path / "s.manifests", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("build.json", "assets-00001.jsonl", "decoys.json", "link", "store"):
+        if name == "link":
+            folder.symlink_to(elsewhere)
+        elif name == "store":
+            shutil.copytree(undisturbed[1], folder)
+        else:
+            folder.mkdir()
+            (folder / name).write_text('{"mine": 1}\n')
+        before = tree(tmp_path)
+        with pytest.raises((StoreError, ConfigError), match=r"not slatprep's|is a link|is a store"):
+            build_store(parameters, out)
+        if name != "decoys.json":
+            with pytest.raises((StoreError, ConfigError), match=r"s\.manifests"):
+                subset_store(undisturbed[1], out, ["a"])
+        assert tree(tmp_path) == before
+        folder.unlink() if name == "link" else shutil.rmtree(folder)
+    build_store(parameters, out)
+    (folder / "assets-00001.jsonl").write_text('{"mine": 1}\n')
+    shutil.rmtree(out)
+    build_store(parameters, out)
+    assert (folder / "assets-00001.jsonl").read_text() == '{"mine": 1}\n'
 
 
 def copied(undisturbed: Made, folder: Path, name: str) -> Path:
