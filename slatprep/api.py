@@ -137,6 +137,8 @@ def _voxels(voxels: ArrayLike, name: str, side: int = RESOLUTION) -> NDArray[np.
         raise ValueError(f"resolution is {side}; expected 2 to {MAX_LATENT_RESOLUTION}")
     array: NDArray[Any] = np.asarray(voxels)
     if array.shape == (side,) * 3:
+        if not np.isin(array, (0, 1)).all():
+            raise ValueError(f"{name} is an occupancy with values other than 0 and 1; threshold it")
         array = voxels_of(array.astype(bool))
     if array.ndim == 2 and array.shape[1] == 4 and not array[:, 0].any():
         array = array[:, 1:]

@@ -126,6 +126,9 @@ def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_f
     [
         (np.zeros((64, 64, 64), bool), "with a voxel in it"),
         (np.empty((0, 3)), "with a voxel in it"),
+        (np.full((64, 64, 64), 0.1), "values other than 0 and 1"),
+        (np.full((64, 64, 64), np.nan), "values other than 0 and 1"),
+        (np.full((64, 64, 64), -1), "values other than 0 and 1"),
         (np.ones((5, 4)), r"shape \(5, 4\)"),
         ([[0, 0, 64]], "from 0 to 64; expected whole numbers in 0..63"),
         ([[0, 0, -1]], "from -1 to 0"),

@@ -49,7 +49,7 @@ def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float
     Parameters
     ----------
     transform : array_like, shape (4, 4)
-        Homogeneous transform; the last row is taken to be 0, 0, 0, 1.
+        Homogeneous transform that multiplies columns; its last row is 0, 0, 0, 1.
     points : array_like, shape (N, 3)
         Points of the transform's source frame.
 
@@ -58,17 +58,35 @@ def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float
     ndarray of float64, shape (N, 3)
         Points of its target frame.
 
+    Raises
+    ------
+    ValueError
+        If the transform has another shape or another last row.
+
     Examples
     --------
     >>> quarter_turn = [[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     >>> apply_transform(quarter_turn, [[2, 3, 4]]).tolist()
     [[-2.0, 2.0, 4.0]]
     """
-    matrix = np.asarray(transform, dtype=np.float64)
+    matrix = _homogeneous(transform)
     mapped: NDArray[np.float64] = np.asarray(points, dtype=np.float64) @ matrix[:3, :3].T
     for axis in range(3):  # Along narrow rows numpy takes five times as long.
         mapped[..., axis] += matrix[axis, 3]
     return mapped
+
+
+def _homogeneous(transform: ArrayLike) -> NDArray[np.float64]:
+    """Return a transform as a matrix (4, 4); ValueError if it is none that multiplies columns."""
+    matrix = np.asarray(transform, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise ValueError(f"a transform is a finite 4x4 matrix, got shape {matrix.shape}")
+    if matrix[3].tolist() != [0, 0, 0, 1]:
+        raise ValueError(
+            f"the last row of a transform must be 0, 0, 0, 1, got {matrix[3].tolist()}; "
+            "transpose a matrix that multiplies rows"
+        )
+    return matrix
 
 
 def make_transform(
@@ -91,9 +109,9 @@ def split_transform(
 
     ValueError if the matrix is not 4x4, not finite, mirrors, or is no similarity.
     """
-    matrix = np.asarray(transform, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError(f"a transform is a finite 4x4 matrix, got shape {matrix.shape}")
+    if not np.isfinite(transform).all():
+        raise ValueError("a transform is a finite 4x4 matrix, got NaN or an infinity")
+    matrix = _homogeneous(transform)
     determinant = float(np.linalg.det(matrix[:3, :3]))
     if determinant <= 0:
         raise ValueError(f"a transform must not mirror or flatten, got determinant {determinant:g}")

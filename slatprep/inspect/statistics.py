@@ -6,11 +6,12 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import ConfigError
 from slatprep.inspect.overview import UNKNOWN, rows_chosen
 from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
 from slatprep.records import Place, Verdict
@@ -198,9 +199,13 @@ def store_statistics(
 
     Raises
     ------
+    ConfigError
+        If there is no such `weight`.
     StoreError
         If the store cannot be read.
     """
+    if weight not in get_args(Weight):
+        raise ConfigError(f"weight is {weight!r}; expected one of {', '.join(get_args(Weight))}")
     store = open_store(store)
     rows = rows_chosen(store, verdicts, categories)
     column = [str(category) for category in store.column("category")]

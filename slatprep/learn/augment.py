@@ -11,11 +11,12 @@ known, so augmentation is off by default.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import ConfigError
 from slatprep.geometry.frames import cube_symmetries
 from slatprep.records import RESOLUTION
 
@@ -26,8 +27,11 @@ def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
     """Return symmetries as signed permutation matrices (S, 3, 3), the identity first.
 
     ``none`` has the identity, ``upright`` the 8 quarter turns about z and flips that keep the z
-    axis up, ``all`` the 48 of the cube.
+    axis up, ``all`` the 48 of the cube. ConfigError if `kind` is none of these.
     """
+    if kind not in get_args(Augmentation):
+        allowed = ", ".join(get_args(Augmentation))
+        raise ConfigError(f"augmentation is {kind!r}; expected one of {allowed}")
     symmetries = cube_symmetries()
     if kind == "none":
         return symmetries[:1]

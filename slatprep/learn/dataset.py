@@ -136,7 +136,8 @@ class SlatDataset(Dataset[Item]):
     Raises
     ------
     ConfigError
-        If no asset is left, or confidence is asked for and the store has none.
+        If no asset is left, confidence is asked for and the store has none, or `augmentation` is
+        none of the above.
     StoreError
         If the store cannot be read.
     """

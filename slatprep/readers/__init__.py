@@ -123,8 +123,6 @@ def _read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], Sour
         _, shift, scale = split_transform(matrix)
         if not (1 / _FAR < scale < _FAR and np.abs(shift).max() < _FAR):
             raise ValueError(f"scale {scale:g} and shift {shift.tolist()} lead out of a unit cube")
-        if (matrix[3] != (0, 0, 0, 1)).any():
-            raise ValueError(f"the last row must be 0, 0, 0, 1, got {matrix[3].tolist()}")
     except ValueError as error:
         raise InputError(path, str(error), _EXPECTED) from None
     return matrix, source

@@ -31,7 +31,7 @@ from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
 from slatprep.storage.chunks import array_form, read_chunks
-from slatprep.storage.documents import read_bounded
+from slatprep.storage.documents import read_bounded, unique
 from slatprep.storage.files import Listing
 
 DESCRIPTION = "source.json"
@@ -166,6 +166,7 @@ def _parsed(text: bytes, where: str) -> _Description:
     )
     with files.refusing(where, "does not describe plain voxels", expected, ConfigError):
         read: _Description = TypeAdapter(_Description).validate_json(text, strict=True)
+        json.loads(text, object_pairs_hook=unique)  # pydantic takes the last of two keys.
         if len({one.name for one in read.properties}) < len(read.properties):
             raise ValueError("a property has two columns")
         named = read.classes if isinstance(read.classes, tuple) else ("any",)

@@ -84,11 +84,22 @@ def test_inverses_and_parts_of_a_transform(transform):
         np.diag([1.0, 1.0, 0.0, 1.0]),  # flat
         np.diag([1.0, 1.0, 2.0, 1.0]),  # no uniform scale
         np.full((4, 4), np.nan),
+        np.diag([1.0, 1.0, 1.0, np.nan]),
+        make_transform(np.eye(3), (1, 2, 3)).T,  # multiplies rows
+        np.diag([1.0, 1.0, 1.0, 2.0]),
     ],
 )
 def test_what_is_no_similarity_is_refused(matrix):
     with pytest.raises(ValueError, match="a transform"):
         split_transform(matrix)
+
+
+@pytest.mark.parametrize(
+    "matrix", [np.eye(3), make_transform(np.eye(3), (1, 2, 3)).T, np.diag([1.0, 1.0, 1.0, 2.0])]
+)
+def test_points_are_moved_by_no_transform_that_multiplies_rows(matrix):
+    with pytest.raises(ValueError, match="a transform"):
+        apply_transform(matrix, [[1, 2, 3]])
 
 
 def test_of_mirrored_points_the_nearest_similarity_is_no_mirror():

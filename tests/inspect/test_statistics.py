@@ -13,7 +13,7 @@ import zarr
 from support.commands import document, refused, run
 from support.made_store import rewrite
 
-from slatprep import StoreError, open_store
+from slatprep import ConfigError, StoreError, open_store
 from slatprep.cli.output import as_json
 from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.inspect.statistics import (
@@ -242,3 +242,5 @@ def test_wrong_use_is_refused(store):
         ("--category", "boat", "boat"),
     ):
         assert told in refused("stats", store, option, value)
+    with pytest.raises(ConfigError, match="weight is 'zz'; expected one of voxel, asset"):
+        store_statistics(store, weight="zz")  # type: ignore[arg-type]

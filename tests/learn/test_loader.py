@@ -143,6 +143,12 @@ def test_symmetries_are_the_groups_they_should_be():
         assert all(np.array_equal(m @ m.T, np.eye(3)) for m in matrices)
 
 
+@pytest.mark.parametrize("kind", [None, "Upright", "al"])
+def test_an_unknown_augmentation_is_refused(learn_store, kind):
+    with pytest.raises(ConfigError, match="expected one of none, upright, all"):
+        SlatDataset(learn_store, augmentation=kind)
+
+
 def test_augmentation_moves_coordinates_and_nothing_else(learn_store):
     plain, turned = SlatDataset(learn_store), SlatDataset(learn_store, augmentation="all", seed=1)
     moved = 0

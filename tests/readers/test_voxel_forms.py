@@ -141,6 +141,16 @@ def test_class_tables_that_no_store_can_have_are_refused(root, classes, said):
         field_at(root)
 
 
+def test_a_key_that_occurs_twice_is_refused(root):
+    about = (
+        (root / "source.json").read_text().replace("{", '{"aligned": true, "aligned": false, ', 1)
+    )
+    (root / "source.json").write_text(about)
+    write_voxels(root, "a", "npz", rows_of(10))
+    with pytest.raises(ConfigError, match="the key 'aligned' occurs twice"):
+        field_at(root)
+
+
 def test_a_class_that_the_table_does_not_have_is_refused(root):
     for material in (3, -1, 0.5):
         rows = rows_of(10)
