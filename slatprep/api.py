@@ -11,6 +11,7 @@ from slatprep.align import align
 from slatprep.geometry.deformation import PlaceMap, map_of
 from slatprep.geometry.voxels import occupancy_of, voxels_of
 from slatprep.parameters import AlignParameters, SampleParameters
+from slatprep.parameters.files import checked
 from slatprep.records import (
     MAX_LATENT_RESOLUTION,
     RESOLUTION,
@@ -56,6 +57,8 @@ def align_voxels(
     ------
     ValueError
         If a voxel set is empty, has another shape, or leaves the grid.
+    ConfigError
+        If a parameter makes no sense.
 
     Notes
     -----
@@ -85,7 +88,7 @@ def align_voxels(
     )
     feats = np.zeros((len(target), 8), dtype=np.float32)
     latents = StructuredLatents(target, feats, resolution=resolution)
-    return align(field, latents, parameters or AlignParameters())
+    return align(field, latents, checked(parameters or AlignParameters()))
 
 
 def annotate_voxels(
@@ -122,13 +125,15 @@ def annotate_voxels(
     ------
     ValueError
         If `coords` are no voxels, or `transform` is no similarity.
+    ConfigError
+        If a parameter makes no sense.
     """
     if isinstance(transform, Alignment):
         place_map = map_of(transform)
     else:
         place_map = PlaceMap(np.asarray(transform, dtype=np.float64))
     places = place_map.places(_voxels(coords, "coords", resolution), resolution)
-    return sample(field, places, parameters or SampleParameters())
+    return sample(field, places, checked(parameters or SampleParameters()))
 
 
 def _voxels(voxels: ArrayLike, name: str, side: int = RESOLUTION) -> NDArray[np.uint8]:

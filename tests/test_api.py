@@ -143,6 +143,30 @@ def test_what_is_no_voxel_set_is_refused_in_words(voxels, said):
         slatprep.align_voxels([[1, 2, 3]], voxels)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (
+            {"engine": "opend3d"},
+            "AlignParameters: engine: got 'opend3d'; expected 'field'",
+        ),
+        ({"scale_bounds": (2, 1)}, r"scale_bounds.0: got 2"),
+        ({"radius": -1}, "radius: got -1"),
+        ({"method": "zz"}, "SampleParameters: method: got 'zz'; expected 'vote' or 'nearest'"),
+        ({"max_distance": np.nan}, "max_distance: got nan"),
+        ({"vote_width": 0}, "vote_width: got 0"),
+    ],
+)
+def test_parameters_that_make_no_sense_are_refused_in_words(wrong, said):
+    asset = make_asset(3)
+    with pytest.raises(ConfigError, match=said):
+        if {*wrong} & {"engine", "scale_bounds", "radius"}:
+            slatprep.align_voxels(asset.coords, asset.coords, AlignParameters(**wrong))
+        else:
+            parameters = SampleParameters(**wrong)
+            slatprep.annotate_voxels(field_of(asset), asset.coords, QUARTER_TURN, parameters)
+
+
 def test_type_checkers_see_the_package_from_outside_the_checkout(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(

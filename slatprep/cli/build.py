@@ -127,7 +127,7 @@ def build_store(
     fresh: bool = False,
     rehash: Annotated[
         float,
-        click.FloatRange(0, 1),
+        options.FiniteRange(0, 1),
         Click(is_flag=False, flag_value="1", show_default=True),
     ] = 0.01,
     compact: bool = False,

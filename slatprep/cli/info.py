@@ -131,7 +131,7 @@ def list_assets(
     store: options.LastStore,
     *,
     chosen: options.ChosenOptions,
-    max_confidence: float | None = None,
+    max_confidence: Annotated[float | None, options.FiniteRange(0, 1)] = None,
     ids: bool = False,
 ) -> None:
     """List the assets of STORE, with the reasons of their verdicts.

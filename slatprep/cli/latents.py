@@ -9,9 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import click
-
-from slatprep.cli.options import AssetIds, File, FileOrUrl, NewFolder
+from slatprep.cli.options import AssetIds, File, FileOrUrl, NewFolder, Whole
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError, InputError, StoreError
@@ -197,7 +195,7 @@ def extract_slat(
     images: tuple[File, ...],
     *,
     out: NewFolder,
-    seeds: Annotated[tuple[int, ...], click.IntRange(min=0), Click("--seed")] = (42,),
+    seeds: Annotated[tuple[int, ...], Whole(min=0), Click("--seed")] = (42,),
     by_folder: bool = False,
     model: ModelOptions,
     no_preprocess: bool = False,

@@ -46,6 +46,17 @@ class FiniteRange(click.FloatRange):
         return number
 
 
+class Whole(click.IntRange):
+    """A range of whole numbers of at most 32 bits, which all that take one have room for."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the number; `click.BadParameter` if it is none of the range."""
+        number: int = super().convert(value, param, ctx)
+        if number >= 2**32:
+            self.fail(f"{value} is above {2**32 - 1}", param, ctx)
+        return number
+
+
 class PlaceType(click.Path):
     """A path, which click checks, or the URL of an object store, which is not checked here."""
 
@@ -82,9 +93,9 @@ class ChoiceOf(_Choice):
         return (*map(str, get_args(listed) or listed), *self._others)
 
 
-Positive = Annotated[int, click.IntRange(min=1)]
+Positive = Annotated[int, Whole(min=1)]
 Above0 = Annotated[float, FiniteRange(min=0, min_open=True)]
-Count = Annotated[int, click.IntRange(min=0)]
+Count = Annotated[int, Whole(min=0)]
 Seed = Count
 """NumPy takes no negative one."""
 File = Annotated[Path, click.Path(path_type=Path, exists=True, dir_okay=False)]

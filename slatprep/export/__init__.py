@@ -79,9 +79,9 @@ def export_store(
         when complete; other files stay.
     format : {"ply", "hdf5", "webdataset", "npz", "voxel_data", "usd"}
         The format, see docs/export.md.
-    assets : sequence of str or int
+    assets : str, or sequence of str or int
         Ids, beginnings of ids, or numbers; empty takes all.
-    verdicts : sequence of str, optional
+    verdicts : str or sequence of str, optional
         Only assets with one of these verdicts; empty takes all. By default `assets` with any
         verdict, or without them all good and doubtful assets.
     options : ExportOptions, optional

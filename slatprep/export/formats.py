@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError
 from slatprep.geometry.frames import voxel_centres
-from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, Verdict
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, Verdict, words_of
 from slatprep.store import Store, StoredAsset
 from slatprep.store.records import StoredRecords
 
@@ -49,6 +49,7 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
 
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
+    assets, verdicts = words_of(assets), words_of(verdicts)
     unknown = sorted(set(verdicts) - set(Verdict))
     if unknown:
         raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import pickletools
 import zipfile
@@ -214,8 +215,9 @@ class Run:
         axes.plot([record.epoch for record in history], errors, "o-", color=INK, ms=4)
         for style, error in zip(("--", ":"), references.values(), strict=True):
             axes.axhline(error, color=MUTED, linestyle=style)
-        top = 1.08 * max(*errors, *references.values())
-        named = {"decoder": errors[-1], **references}
+        known = [error for error in errors if math.isfinite(error)]  # The others diverged.
+        top = 1.08 * max(*known, *references.values())
+        named = {"decoder": known[-1], **references}
         heights = apart([error / top for error in named.values()])
         for name, height in zip(named, heights, strict=True):
             axes.annotate(name, (1.0, height), (6, 0), va="center", textcoords="offset points",

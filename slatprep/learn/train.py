@@ -149,7 +149,8 @@ def train(
     On a CPU, a resumed run gets the same weights as an uninterrupted one; on a GPU the last bits
     may differ. `workers` processes read ahead. `steps` gets the number of batches done and of all,
     in this call alone; `stop_after` epochs it stops, as if interrupted. ConfigError if `out` holds
-    another run, or a split has no asset; InputError if a checkpoint is damaged.
+    another run, a split has no asset, or no epoch
+    is worth keeping as the training diverged; InputError if a checkpoint is damaged.
     """
     opened = open_store(store, copy=True)
     assignment = assign_store(opened, parameters.split_by, parameters.shares)
@@ -179,6 +180,12 @@ def train(
             train_loss, rate = session.run_epoch(steps, lambda: run.save(LAST, session.state()))
             record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
             session.history.append(record)
+            kept = session.history[session.best_epoch]
+            if not math.isfinite(kept.train_loss if val_set is None else kept.val_loss):
+                raise ConfigError(
+                    f"{out}: the training diverged in epoch {record.epoch}: its loss is no finite "
+                    "number; train with a smaller --learning-rate into another --out"
+                )
             # `LAST` comes last: a run that is killed before it repeats the epoch.
             if session.best_epoch == record.epoch:
                 ranges, holds = opened.normalization, opened.contents

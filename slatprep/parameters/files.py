@@ -13,14 +13,16 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_args, get_type_hints
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import (
     CATEGORY,
     NAMED_SPLITS,
     PRESETS,
+    AlignParameters,
     BuildParameters,
+    SampleParameters,
     is_split_file,
     percentiles_of,
 )
@@ -122,10 +124,24 @@ def load_parameters(
     return parameters
 
 
+_Group = TypeVar("_Group", AlignParameters, SampleParameters)
+
+
+def checked(group: _Group) -> _Group:
+    """Return parameters made in Python, checked as those of a file; ConfigError as there."""
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        found: _Group = TypeAdapter(type(group)).validate_python(asdict(group))
+    except ValidationError as error:
+        raise ConfigError(_explain(error.errors()[0], _Origin(type(group).__name__, {}))) from None
+    return found
+
+
 class _Origin(NamedTuple):
     """The origin of values, for error messages that lead back to them."""
 
-    config: Path | None
+    config: Path | str | None
     overrides: Overrides
 
     def of(self, name: str) -> str:

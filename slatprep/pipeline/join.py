@@ -23,7 +23,7 @@ from slatprep.pipeline.publish import BuildSummary, Destination, publish_store
 from slatprep.pipeline.rows import NextStore, Row, SourceStore
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside
-from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange
+from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange, words_of
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
 from slatprep.store import open_store
@@ -59,7 +59,7 @@ def subset_store(
         The store to choose from; it stays as it is.
     out : str or Place
         The new store, a path or URL; an existing one is replaced in one step.
-    assets : iterable of str or int
+    assets : str, or iterable of str or int
         Ids, beginnings of ids that no other has, or numbers; see `Store.match`.
     manifests : str or Path, optional
         Folder of its records; by default beside it.
@@ -82,7 +82,7 @@ def subset_store(
     """
     source = _source(store)
     everything = _rows([source])
-    rows = [everything[row] for row in {source.match(name) for name in assets}]
+    rows = [everything[row] for row in {source.match(name) for name in words_of(assets)}]
     if not rows:
         raise ConfigError(f"no asset of {source.path} is chosen; expected one at least")
     place, parameters = Destination(out, manifests), _parameters([source], source.build)

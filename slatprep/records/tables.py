@@ -7,11 +7,11 @@ latents beside them.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Iterable
 from colorsys import hls_to_rgb
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import numpy as np
 from annotated_types import Ge, Le, MaxLen
@@ -99,7 +99,10 @@ for _material, _colour in MATERIAL_COLOURS.items():
     COLOURS[_material] = tuple(bytes.fromhex(_colour[1:]))
 
 
-def words_of(given: Collection[str]) -> Collection[str]:
+_Words = TypeVar("_Words", bound=Iterable[object])
+
+
+def words_of(given: _Words) -> _Words | tuple[str]:
     """Return words of which one alone may be given as a text."""
     return (given,) if isinstance(given, str) else given
 

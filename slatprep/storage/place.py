@@ -62,13 +62,15 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     """Return a path of the local disk, or a `RemotePlace` for the URL of an object store.
 
     A relative path starts from `folder`, if given. Links in it are then resolved, and ``~`` stands
-    for the user's folder.
+    for the user's folder. TypeError if it is neither a text nor a path.
 
     >>> print(place_of("s3://bucket/demo.zarr") / "zarr.json")
     s3://bucket/demo.zarr/zarr.json
     >>> print(place_of("file:///data/demo.zarr"))
     /data/demo.zarr
     """
+    if not (isinstance(text, str | os.PathLike) or is_place(text)):
+        raise TypeError(f"{text!r} is no place; expected a path or a URL")
     url = _URL.fullmatch(str(text))
     if url and url[1] not in _LOCAL:
         return RemotePlace(url[1], PurePosixPath(url[2]))

@@ -263,7 +263,8 @@ class AssetTable:
         -------
         dict of str to ndarray
             ``id``, ``voxels``, and the ``asset/*`` arrays by their last names, but for
-            ``offset`` and ``transform``; of ``property_ambiguity`` one column a property.
+            ``offset`` and ``transform``; of ``property_ambiguity`` one column a property. Those
+            of the store are read-only; copy one to change it.
         """
         columns = {"id": np.array(self.ids, dtype=object), "voxels": np.diff(self.offsets)}
         for name in ASSET_COLUMNS:
@@ -296,9 +297,10 @@ class AssetTable:
         return {asset_id: index for index, asset_id in enumerate(self.ids)}
 
     def cached_column(self, name: str) -> NDArray[Any]:
-        """Return an ``asset/*`` array as `column` does, read once."""
+        """Return an ``asset/*`` array as `column` does, read once and so read-only."""
         if name not in self._columns:
             self._columns[name] = self.column(name)
+            self._columns[name].flags.writeable = False
         return self._columns[name]
 
     def read_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:

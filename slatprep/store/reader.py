@@ -278,7 +278,7 @@ class Store(AssetTable):
             store=self,
             index=index,
             asset_id=self.ids[index],
-            transform=np.asarray(self.cached_column("transform")[index]),
+            transform=self.cached_column("transform")[index].copy(),
             columns={name: self.cached_column(name)[index] for name in ASSET_COLUMNS},
             **arrays,
         )

@@ -103,6 +103,20 @@ def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tm
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("build-store", "--rehash", "nan"),
+        ("measure-errors", "--seed", 10**26),
+        ("train", "--batch-size", 10**22),
+        ("extract-slat", "--seed", 2**32),
+        ("list", "--max-confidence", "nan"),
+    ],
+)
+def test_numbers_beyond_reason_are_refused(words):
+    assert f"Invalid value for '{words[1]}'" in refused(*words)
+
+
 def test_a_misspelt_command_is_told_with_the_one_meant():
     assert "did you mean check-alignment?" in refused("chek-alignment", "--worst", "3")
     refused("xyzzy")

@@ -25,7 +25,7 @@ from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
 from slatprep.readers.splits import Shares, split_objects
 from slatprep.storage.files import file_name
-from slatprep.store import Store
+from slatprep.store import Store, open_store
 
 KINDS = ("hdf5", "npz")
 """A format of one file, and one of a folder."""
@@ -218,6 +218,15 @@ def test_assets_are_chosen_by_id_and_verdict(store, tmp_path):
     ):
         with pytest.raises(ConfigError, match=said):
             export_store(store, tmp_path / "none", "npz", **arguments)
+
+
+def test_a_text_is_one_asset_and_one_verdict(store, tmp_path):
+    one = open_store(store).ids[1]
+    assert export_store(store, tmp_path / "one", "ply", assets=one).assets == 1
+    with pytest.raises(ConfigError, match="no asset 23;"):
+        export_store(store, tmp_path / "none", "ply", assets="23")
+    listed = export_store(store, tmp_path / "list", "ply", verdicts=["good"])
+    assert export_store(store, tmp_path / "good", "ply", verdicts="good").assets == listed.assets
 
 
 def test_splits_go_out_apart_and_together_they_are_all(store, tmp_path):

@@ -197,6 +197,12 @@ def test_an_epoch_that_diverged_is_not_the_best(learn_store, tmp_path):
     assert summary.best_epoch == 0
 
 
+def test_a_training_without_an_epoch_to_keep_says_that_it_diverged(learn_store, tmp_path):
+    words = ("train", learn_store, "--out", tmp_path / "run", *SMALL, "--shares", "0.4,0.3,0.3")
+    said = refused(*words, "--learning-rate", "1e10", "--epochs", "4")
+    assert "diverged in epoch" in said and "smaller --learning-rate" in said
+
+
 def test_baselines_are_what_numpy_finds(learn_store):
     store = open_store(learn_store)
     columns = ("coords", "feats", "properties", "material", "valid")

@@ -55,6 +55,12 @@ def test_an_update_of_a_subset_has_the_ranges_of_its_own_dataset(make_dataset, t
     assert tree(out) == tree(tmp_path / "first.zarr")
 
 
+def test_a_text_is_one_asset_and_nothing_is_no_place(folder, tmp_path):
+    assert subset_store(folder / "abcd.zarr", tmp_path / "s.zarr", "b.front").statuses["ok"] == 1
+    with pytest.raises(TypeError, match="None is no place; expected a path or a URL"):
+        subset_store(folder / "abcd.zarr", None, ["d"])  # type: ignore[arg-type]
+
+
 def test_joined_stores_are_the_build_of_all_their_assets(folder, tmp_path):
     concat_stores([folder / "bd.zarr", folder / "ac.zarr"], tmp_path / "all.zarr")
     assert tree(tmp_path / "all.zarr") == tree(folder / "abcd.zarr")

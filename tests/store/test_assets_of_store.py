@@ -109,6 +109,15 @@ def test_columns_are_those_of_the_arrays(made):
         store.column("verdikt")
 
 
+def test_what_is_changed_in_an_asset_or_table_changes_nothing_in_the_store(made):
+    store = open_store(made[0].path)
+    before = store[0].transform.copy()
+    store[0].transform[0, 3] += 1
+    np.testing.assert_array_equal(store[0].transform, before)
+    with pytest.raises(ValueError, match="read-only"):
+        store.table()["verdict"][:] = "failed"
+
+
 def test_properties_are_found_by_name(made):
     store, _ = made
     assert store.columns_of(["poissons_ratio", "youngs_modulus"]) == [2, 0]
