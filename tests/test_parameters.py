@@ -168,6 +168,8 @@ def test_what_is_no_definition_is_named(folder):
     path = write(folder, MINIMAL + "[align\n")
     message = message_of(path)
     assert message.startswith(f"{path}: not valid TOML") and "line 8" in message
+    assert "texts need quotes" not in message
+    assert "line 8" in message and "texts need quotes" in message_of(write(folder, "name = pixie"))
     assert "absent.toml" in message_of(folder / "absent.toml")
     (folder / "binary.toml").write_bytes(b"\xff\xfe\x00")
     assert "binary.toml" in message_of(folder / "binary.toml")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -302,8 +303,11 @@ def report(output: Output, summary: BuildSummary) -> None:
     from slatprep.records import Verdict
 
     _show_damaged(output, summary.damaged)
+    looked = ""
     for asset_id, reason in summary.problems:
-        output.problem(f"{asset_id}: {reason}")
+        what, _, names = reason.partition("; looked for ")
+        output.problem(f"{asset_id}: {what if names == looked else reason}")
+        looked = names or looked  # The same names are told once.
     total, good = sum(summary.statuses.values()), summary.statuses["ok"]
     for asset_id in summary.contradicted:
         output.note(f"{asset_id}: its latents contradict its labels; look at it first")
@@ -381,6 +385,10 @@ def subset(
     if chosen.verdicts or chosen.categories:
         opened = options.opened(store)
         wanted += [asset.asset_id for asset in list_assets(opened, *chosen.of(opened))]
+        if not wanted:
+            there = sorted(Counter(map(str, opened.column("verdict"))).items())
+            counts = ", ".join(f"{count:,} {verdict}" for verdict, count in there)
+            raise click.UsageError(f"no asset of {store} is of that kind; there are {counts}")
     with output.progress("subset", "shards") as progress:
         summary = subset_store(
             store, out, wanted, manifests=manifests, jobs=jobs, progress=progress

@@ -223,7 +223,25 @@ class PrintingCommand(click.Command):
         # Asked before, since click takes parsed words out of the list.
         as_json = "--json" in args and not ctx.resilient_parsing
         with Output(as_json, 0, ctx.command_path.partition(" ")[2]).failing():
-            return super().parse_args(ctx, args)
+            try:
+                return super().parse_args(ctx, args)
+            except click.BadParameter as error:
+                error.message = _in_words(error)
+                raise
+
+
+def _in_words(error: click.BadParameter) -> str:
+    """Return what is wrong with a value; click says of a word that it is no "integer range"."""
+    kind, (value, wrong, _) = (
+        error.param and error.param.type,
+        error.message.partition(" is not a "),
+    )
+    if not wrong or not isinstance(kind, click.IntRange | click.FloatRange):
+        return error.message
+    words = ("above" if kind.min_open else "at least", kind.min), ("at most", kind.max)
+    ends = " and ".join(f"{word} {end:g}" for word, end in words if end is not None)
+    noun = "whole number" if isinstance(kind, click.IntRange) else "number"
+    return f"{value} is no {noun}; expected a {noun} of {ends}"
 
 
 def local_path(value: Any) -> Any:

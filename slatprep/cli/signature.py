@@ -131,6 +131,8 @@ def _declared(
     settings: dict[str, Any] = {"required": parameter.default is parameter.empty}
     if parameter.default not in (parameter.empty, None, ()):
         settings["default"] = parameter.default
+        if parameter.default == "":
+            settings["show_default"] = False
     flag = f"--{parameter.name.replace('_', '-')}"
     for entry in told:
         if isinstance(entry, str):

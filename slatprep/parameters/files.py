@@ -160,7 +160,8 @@ def _read(path: Path) -> dict[str, Any]:
         fault = next(_faults_in(data), None)
     except tomllib.TOMLDecodeError as error:
         # tomllib's own message ends with the line and column.
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+        hint = "; texts need quotes" if str(error).startswith("Invalid value") else ""
+        raise ConfigError(f"{path}: not valid TOML: {error}{hint}") from error
     except RecursionError:
         raise ConfigError(f"{path}: not valid TOML: nested too deeply") from None
     except (OSError, ValueError) as error:

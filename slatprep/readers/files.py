@@ -50,6 +50,13 @@ _KIND_NAMES = {
 
 _COMPLETE = "a complete file; copy or make it again"
 _INTACT_NPZ = "an intact npz archive, as numpy.savez writes it; copy or make it again"
+_BEGIN = {
+    b"PK\x03\x04": "it begins as one, and may be cut off",
+    b"\x93NUMPY": "it is one array, as numpy.save writes it",
+    b"\x89HDF": "it is an HDF5 file",
+    b"\x80": "it looks like a pickle",
+}
+"""What files called npz are instead, by their first bytes."""
 
 # What numpy, zipfile, zlib and h5py raise for bytes that are damaged or of another make.
 _DAMAGE = (
@@ -220,7 +227,9 @@ def npz_arrays(
             if present.count(name) != 1:
                 more = f" and {len(present) - 8} more" if len(present) > 8 else ""
                 found = (", ".join(sorted(present)[:8]) or "nothing") + more
-                fault = f"has {present.count(name)} arrays named {name!r} (it holds {found})"
+                count = present.count(name)
+                own = f"{count} arrays named" if count else "no array"
+                fault = f"has {own} {name!r} (it holds {found})"
                 raise InputError(where, fault, f"one array each of {', '.join(specs)}")
         return {
             name: _read_member(archive, infos[present.index(name)], where, specs[name])
@@ -250,7 +259,8 @@ def _open_zip(data: bytes, where: str | Place) -> zipfile.ZipFile:
     # zipfile makes an object for every directory entry before one can ask how many there are.
     if data.count(b"PK\x01\x02") > MAX_MEMBERS:
         raise InputError(where, f"has more than {MAX_MEMBERS} members", _INTACT_NPZ)
-    with refusing(where, "is no readable npz archive", _INTACT_NPZ):
+    kind = next((f": {words}" for start, words in _BEGIN.items() if data.startswith(start)), "")
+    with refusing(where, f"is no readable npz archive{kind}", _INTACT_NPZ):
         return zipfile.ZipFile(io.BytesIO(data))
 
 

@@ -192,7 +192,10 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
         chosen = dict(zip(named, pair, strict=True))
         given = ", ".join(f'{name} = "{unit}"' for name, unit in chosen.items() if unit)
         words = " and ".join(unit for unit in pair if unit)
-        setting = f"or say units = {{ {given} }} in [pixieverse] of the dataset definition"
+        setting = (
+            f"or say units = {{ {given} }} in [pixieverse] of the dataset definition (a TOML file "
+            "given with --config)"
+        )
         yield Mistake(words, setting, partial(_scaled, pair))
     if {part.name for part in parts} & LIGHTEST.keys():
         yield Mistake(

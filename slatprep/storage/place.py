@@ -7,6 +7,7 @@ only this module asks which kind it is.
 
 from __future__ import annotations
 
+import difflib
 import io
 import os
 import re
@@ -133,8 +134,12 @@ class Storage:
         if self.local is None:
             return "does not exist"
         above = next(path for path in self.local.absolute().parents if path.is_dir())
-        names = sorted(path.name for path in islice(above.iterdir(), 1000) if path.is_dir())[:5]
-        return f"does not exist; {above} does, and holds the folders {', '.join(names) or '(none)'}"
+        names = sorted(path.name for path in islice(above.iterdir(), 1000) if path.is_dir())
+        wanted = self.local.absolute().relative_to(above).parts[0]
+        if close := difflib.get_close_matches(wanted, names, n=1):
+            return f"does not exist; did you mean {above / close[0]}?"
+        held = ", ".join(names[:5]) or "(none)"
+        return f"does not exist; {above} does, and holds the folders {held}"
 
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
         """Look at archives that lie in the place, of whose members those like `wanted` matter.

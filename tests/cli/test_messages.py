@@ -122,6 +122,41 @@ def test_a_misspelt_command_is_told_with_the_one_meant():
     refused("xyzzy")
 
 
+@pytest.mark.parametrize(("words", "said"), [
+    (("build-store", "--jobs", "two"), "'two' is no whole number; expected a whole number of"),
+    (("make-demo", "d", "--level", "x"), "expected a whole number of at least 0 and at most 7"),
+    (("simulate", "--height", "x"), "'x' is no number; expected a number of at least 0"),
+    (("build-store", "--jobs", "0"), "0 is not in the range x>=1"),
+])  # fmt: skip
+def test_a_word_in_place_of_a_number_is_told_with_what_is_expected(words, said):
+    assert said in " ".join(refused(*words).split())
+
+
+def test_no_default_is_printed_of_an_option_that_is_empty_without_it():
+    assert '""' not in run("publish", "--help").stdout
+
+
+def test_a_choice_that_leaves_nothing_says_what_there_is(store, tmp_path):
+    told = refused("subset", store, "--verdict", "failed", "--out", tmp_path / "s.zarr")
+    assert f"no asset of {store} is of that kind; there are 5 good" in told
+
+
+def test_names_that_were_looked_for_are_told_once(make_dataset, tmp_path):
+    dataset = make_dataset(*"abc")
+    for name in "ab":
+        (dataset.root / "slat" / f"{name}.npz").unlink()
+    words = "--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat"
+    told = refused("build-store", *words, "--out", tmp_path / "s.zarr", code=1)
+    assert "a: " in told and "no SLAT for id 'b'" in told
+    assert told.count("looked for") == 1
+
+
+def test_a_misspelt_folder_is_told_with_the_one_meant(make_dataset, tmp_path):
+    root = make_dataset("a").root
+    words = "--pixieverse", root / "pixeverse", "--slat", root / "slat", "--out", tmp_path / "s"
+    assert f"did you mean {root}/pixieverse?" in refused("build-store", *words)
+
+
 def test_what_catalogues_ask_for_is_named_where_it_is_not_stated(store):
     told = run("describe", store, "--license", "https://spdx.org/licenses/MIT")
     assert "also ask for --cite-as, --date-published" in told.stderr

@@ -148,7 +148,7 @@ def test_missing_array_and_group(make_pair):
     pair = make_pair()
     for missing, arrays in (("feats", {"coords": COORDS}), ("coords", {"feats": FEATS})):
         np.savez(pair.slat, **arrays)
-        with pytest.raises(InputError, match=f"0 arrays named '{missing}'"):
+        with pytest.raises(InputError, match=f"has no array '{missing}'"):
             read_latents(pair)
         with pytest.raises(
             InputError, match=f"has no dataset '{missing}'.* datasets coords, feats"

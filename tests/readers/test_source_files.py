@@ -2,6 +2,7 @@
 
 import io
 import os
+import pickle
 import struct
 import zipfile
 import zlib
@@ -154,6 +155,10 @@ def test_npz_that_numpy_does_not_write_is_refused():
         (npz_bytes(zipfile.ZIP_LZMA, feats=npy(FEATS)), "uses zip compression"),
         (file.getvalue(), "has 2 arrays named 'feats'"),
         (npz_bytes(**{f"m{i}": b"" for i in range(300)}), "more than 256 members"),
+        (npz_bytes(), "has no array 'feats'"),
+        (npy(FEATS), "npz archive: it is one array"),
+        (pickle.dumps(FEATS), "npz archive: it looks like a pickle"),
+        (npz_bytes(feats=npy(FEATS))[:-40], "npz archive: it begins as one, and may be cut off"),
     ):
         with pytest.raises(InputError, match=said):
             npz_arrays(data, "x.npz", ROWS)
