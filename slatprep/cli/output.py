@@ -226,18 +226,19 @@ class PrintingCommand(click.Command):
             try:
                 return super().parse_args(ctx, args)
             except click.BadParameter as error:
-                error.message = _in_words(error)
+                if told := _in_words(error):
+                    raise click.BadParameter(told, ctx, error.param) from None
                 raise
 
 
 def _in_words(error: click.BadParameter) -> str:
-    """Return what is wrong with a value; click says of a word that it is no "integer range"."""
+    """Return why a word is no number, of which click says "integer range"; else nothing."""
     kind, (value, wrong, _) = (
         error.param and error.param.type,
         error.message.partition(" is not a "),
     )
     if not wrong or not isinstance(kind, click.IntRange | click.FloatRange):
-        return error.message
+        return ""
     words = ("above" if kind.min_open else "at least", kind.min), ("at most", kind.max)
     ends = " and ".join(f"{word} {end:g}" for word, end in words if end is not None)
     noun = "whole number" if isinstance(kind, click.IntRange) else "number"
