@@ -5,7 +5,9 @@ from __future__ import annotations
 import mmap
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -35,12 +37,15 @@ COUNTS = {27, 33, 38, 39}
 
 
 @pytest.fixture
-def on_a_disk(tmp_path: Path) -> Path:
-    """Return a folder where states count; tests about what spoils them need one."""
-    (tmp_path / "probe").touch()
-    if States().of(str(tmp_path / "probe")) is None:
-        pytest.skip("the folder for temporary files lies where no state counts")
-    return tmp_path
+def on_a_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """Give a folder where states count, even if temporary files lie in memory."""
+    with TemporaryDirectory(dir=request.config.rootpath, prefix=".tests-") as beside:
+        for folder in (tmp_path, Path(beside)):
+            (folder / "probe").touch()
+            if States().of(str(folder / "probe")) is not None:
+                yield folder
+                return
+    pytest.skip("neither temporary files nor the checkout lie where a state counts")
 
 
 def lasting(path: Path) -> states.State | None:
