@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 
@@ -25,6 +25,12 @@ def amount(count: int, noun: str, plural: str = "") -> str:
     ('1 voxel', '2,000 voxels', '0 categories')
     """
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
+def require_one_of(name: str, value: object, allowed: Iterable[str]) -> None:
+    """Raise ConfigError if a parameter's value is none of the allowed words."""
+    if value not in (words := tuple(allowed)):
+        raise ConfigError(f"{name} is {value!r}; expected one of {', '.join(words)}")
 
 
 class SlatprepError(Exception):

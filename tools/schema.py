@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from slatprep.storage.documents import adapter_of
 from slatprep.store.record import BuildRecord, Record
-from slatprep.store.record_json import FOLDER, adapter_of
+from slatprep.store.record_json import FOLDER
 
 KINDS = {"asset": Annotated[Record, Field(discriminator="status")], "build": BuildRecord}
 

@@ -300,12 +300,13 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
 
 def report(output: Output, summary: BuildSummary) -> None:
     """Print the outcome of a build and the assets that failed, and set the exit code."""
+    from slatprep.readers.pairing import LOOKED_FOR
     from slatprep.records import Verdict
 
     _show_damaged(output, summary.damaged)
     looked = ""
     for asset_id, reason in summary.problems:
-        what, _, names = reason.partition("; looked for ")
+        what, _, names = reason.partition(LOOKED_FOR)
         output.problem(f"{asset_id}: {what if names == looked else reason}")
         looked = names or looked  # The same names are told once.
     total, good = sum(summary.statuses.values()), summary.statuses["ok"]

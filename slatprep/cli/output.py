@@ -233,10 +233,8 @@ class PrintingCommand(click.Command):
 
 def _in_words(error: click.BadParameter) -> str:
     """Return why a word is no number, of which click says "integer range"; else nothing."""
-    kind, (value, wrong, _) = (
-        error.param and error.param.type,
-        error.message.partition(" is not a "),
-    )
+    kind = error.param and error.param.type
+    value, wrong, _ = error.message.partition(" is not a ")
     if not wrong or not isinstance(kind, click.IntRange | click.FloatRange):
         return ""
     words = ("above" if kind.min_open else "at least", kind.min), ("at most", kind.max)

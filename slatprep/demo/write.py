@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,15 +15,14 @@ from slatprep.demo.latents import GRIDS, Encoder
 from slatprep.demo.sources import Source, columns_of, write_field, write_hdf5
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.geometry.voxels import shown_in_cells
-from slatprep.normalize import PIXIE_RANGES
+from slatprep.normalize import PIXIE_RANGES, normalize_mapped
 from slatprep.records import BACKGROUND, RESOLUTION
 
 SlatForm = Literal["npz", "npz-batch", "hdf5", "hdf5-groups"]
 SlatNames = Literal["id", "sha256"]
 
-_YOUNGS_MODULUS, _DENSITY, _POISSONS_RATIO = PIXIE_RANGES.ranges
-_LO, _HI = np.array([(one.lo, one.hi) for one in (_DENSITY, _YOUNGS_MODULUS, _POISSONS_RATIO)]).T
-"""Ends of Pixie's ranges (3,), in the order of its channels."""
+_CHANNELS = replace(PIXIE_RANGES, ranges=tuple(PIXIE_RANGES.ranges[k] for k in (1, 0, 2)))
+"""Pixie's ranges in the order of its channels: density, Young's modulus, Poisson's ratio."""
 
 
 def row_id(asset: DemoAsset, view: DemoView) -> str:
@@ -82,7 +82,7 @@ def _prediction(grid: NDArray[np.float32], scores: bool = True) -> NDArray[np.fl
     """Return a grid as Pixie's network predicts it: channels first, classes as scores or ids."""
     values = grid[..., :3].astype(np.float64)
     values[..., :2] = np.log10(values[..., :2] + 1e-6)
-    values = 2.0 * (np.clip(values, _LO, _HI) - _LO) / (_HI - _LO) - 1
+    values = np.clip(normalize_mapped(values, _CHANNELS), -1.0, 1.0)
     # A prediction has no class -1: voxels without a label become background.
     ids = np.where(grid[..., 3] < 0, BACKGROUND, grid[..., 3])
     classes = ids[..., None] == np.arange(8) if scores else ids[..., None]

@@ -13,7 +13,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from slatprep.errors import ConfigError
+from slatprep.errors import require_one_of
 from slatprep.export import target
 from slatprep.export.formats import Exported, ExportOptions, Writer, choose_ids, describe_columns
 from slatprep.records import USABLE, Place
@@ -105,8 +105,7 @@ def export_store(
         If the store cannot be read.
     """
     begin = time.perf_counter()
-    if format not in FORMATS:
-        raise ConfigError(f"format is {format!r}; expected one of {', '.join(FORMATS)}")
+    require_one_of("format", format, FORMATS)
     options, store, out = options or ExportOptions(), place_of(store), Path(out)
     opened = open_store(store)
     require_outside(out)

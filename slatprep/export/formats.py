@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep.errors import ConfigError, StoreError, require_one_of
 from slatprep.geometry.frames import voxel_centres
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, Verdict, words_of
 from slatprep.store import Store, StoredAsset
@@ -50,9 +50,8 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
     assets, verdicts = words_of(assets), words_of(verdicts)
-    unknown = sorted(set(verdicts) - set(Verdict))
-    if unknown:
-        raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
+    for one in sorted(verdicts):
+        require_one_of("verdict", one, Verdict)
     rows = sorted({store.match(name) for name in assets}) or range(len(store))
     verdict = store.column("verdict")
     ids = (store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts)

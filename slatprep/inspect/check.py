@@ -129,8 +129,7 @@ class AlignmentCheck:
         return (
             f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary lie "
             f"within {self.radius:g} voxel of the other side before any deformation; placements "
-            f"that fit as well change "
-            f"{ties}",
+            f"that fit as well change {ties}",
         )
 
     @property

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError
+from slatprep.errors import require_one_of
 from slatprep.inspect.overview import UNKNOWN, rows_chosen
 from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
 from slatprep.records import Place, Verdict
@@ -204,8 +204,7 @@ def store_statistics(
     StoreError
         If the store cannot be read.
     """
-    if weight not in get_args(Weight):
-        raise ConfigError(f"weight is {weight!r}; expected one of {', '.join(get_args(Weight))}")
+    require_one_of("weight", weight, get_args(Weight))
     store = open_store(store)
     rows = rows_chosen(store, verdicts, categories)
     column = [str(category) for category in store.column("category")]

@@ -16,7 +16,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError
+from slatprep.errors import require_one_of
 from slatprep.geometry.frames import cube_symmetries
 from slatprep.records import RESOLUTION
 
@@ -29,9 +29,7 @@ def lattice_symmetries(kind: Augmentation) -> NDArray[np.int64]:
     ``none`` has the identity, ``upright`` the 8 quarter turns about z and flips that keep the z
     axis up, ``all`` the 48 of the cube. ConfigError if `kind` is none of these.
     """
-    if kind not in get_args(Augmentation):
-        allowed = ", ".join(get_args(Augmentation))
-        raise ConfigError(f"augmentation is {kind!r}; expected one of {allowed}")
+    require_one_of("augmentation", kind, get_args(Augmentation))
     symmetries = cube_symmetries()
     if kind == "none":
         return symmetries[:1]

@@ -31,6 +31,7 @@ from slatprep.records import (
     StructuredLatents,
 )
 from slatprep.storage.atomic import staged
+from slatprep.storage.documents import adapter_of
 from slatprep.storage.files import file_digest, file_name
 
 BATCH_VOXELS = 65_536
@@ -155,14 +156,12 @@ def _ranges_in(state: dict[str, Any], count: int) -> NDArray[np.float64]:
 
 def _contents_in(state: dict[str, Any]) -> Contents:
     """Return what a decoder was trained on."""
-    from pydantic import TypeAdapter
-
     document = orjson.loads(_text_in(state, "contents"))
     document["properties"] = [
         dict(zip(("name", "unit", "log10"), row, strict=True)) for row in document["properties"]
     ]
     # Without the bounds of values, since JSON has no infinity.
-    contents: Contents = TypeAdapter(Contents).validate_json(orjson.dumps(document), strict=True)
+    contents: Contents = adapter_of(Contents).validate_json(orjson.dumps(document), strict=True)
     if not 0 < len(contents.properties) <= MAX_PROPERTIES:
         raise ValueError(f"it has {len(contents.properties)} properties, not 1 to {MAX_PROPERTIES}")
     if len(contents.classes) > MANY_BACKGROUND:

@@ -34,7 +34,7 @@ from slatprep.records import (
     Verdict,
 )
 from slatprep.storage.chunks import MAX_CHUNK_BYTES, array_form, read_chunks
-from slatprep.storage.documents import read_document
+from slatprep.storage.documents import adapter_of, read_document
 from slatprep.storage.files import LINK, LocalFolder, file_name, local_files
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import MAX_METADATA_BYTES
@@ -104,15 +104,13 @@ def selection_of_run(predictions: Path) -> tuple[Path, dict[str, Any], dict[str,
     `slatprep.learn.splits.assign_store`, and the filters of `slatprep.learn.splits.select_assets`.
     InputError if the file lacks one of them.
     """
-    from pydantic import TypeAdapter
-
     file = predictions.absolute().parent / RUN_FILE
     if not file.exists():
         return None
     try:
         run = read_document(file, RUN_BYTES)
         named = {name: run[name] for name in ("shares", "verdicts", "max_ambiguity")}
-        filters = dict(vars(TypeAdapter(_Selection).validate_python(named)))
+        filters = dict(vars(adapter_of(_Selection).validate_python(named)))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             file,

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, require_one_of
 from slatprep.readers.splits import HASH, SPLITS, Assignment, Split, assign_splits
 from slatprep.readers.splits import Shares as Shares
 from slatprep.readers.splits import split_of as split_of
@@ -51,9 +51,8 @@ def select_assets(
     chosen = store.column("valid_share") > 0
     if verdicts is not None:
         verdicts = words_of(verdicts)
-        unknown = sorted(set(verdicts) - set(Verdict))
-        if unknown:
-            raise ConfigError(f"verdict is {unknown[0]!r}; expected one of {', '.join(Verdict)}")
+        for one in sorted(verdicts):
+            require_one_of("verdict", one, Verdict)
         chosen &= np.isin(store.column("verdict").astype(str), sorted(verdicts))
     if max_ambiguity is not None:
         chosen &= store.column("ambiguity") <= max_ambiguity

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, require_one_of
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
@@ -32,6 +32,7 @@ from slatprep.learn.splits import assign_store
 from slatprep.readers.files import refusing
 from slatprep.readers.splits import HASH, Assignment, Shares, Split
 from slatprep.records import USABLE, Place
+from slatprep.storage.documents import adapter_of
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
 
@@ -104,10 +105,7 @@ class TrainParameters:
 
     def __post_init__(self) -> None:
         for name, allowed in (("size", tuple(SIZES)), ("precision", PRECISIONS), ("keep", KEEPS)):
-            if getattr(self, name) not in allowed:
-                raise ConfigError(
-                    f"{name} is {getattr(self, name)!r}; expected one of {', '.join(allowed)}"
-                )
+            require_one_of(name, getattr(self, name), allowed)
 
 
 @dataclass(frozen=True)
@@ -149,8 +147,8 @@ def train(
     On a CPU, a resumed run gets the same weights as an uninterrupted one; on a GPU the last bits
     may differ. `workers` processes read ahead. `steps` gets the number of batches done and of all,
     in this call alone; `stop_after` epochs it stops, as if interrupted. ConfigError if `out` holds
-    another run, a split has no asset, or no epoch
-    is worth keeping as the training diverged; InputError if a checkpoint is damaged.
+    another run, a split has no asset, or the training diverged before any epoch was worth keeping;
+    InputError if a checkpoint is damaged.
     """
     opened = open_store(store, copy=True)
     assignment = assign_store(opened, parameters.split_by, parameters.shares)
@@ -345,8 +343,6 @@ class _Session:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resume from a checkpoint; raises ValueError and others if it does not fit the model."""
-        from pydantic import TypeAdapter
-
         # Order, augmentation and learning rate follow from seed and epoch and are not saved.
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -354,7 +350,7 @@ class _Session:
             for name in ("exp_avg", "exp_avg_sq"):
                 if moments[name].shape != parameter.shape:
                     raise ValueError(f"{name} has shape {tuple(moments[name].shape)}")
-        self.history = TypeAdapter(list[EpochRecord]).validate_python(state["history"])
+        self.history = adapter_of(list[EpochRecord]).validate_python(state["history"])
         self.losses = state["losses"].tolist()
         if not (self.history or self.losses):
             raise ValueError("it has no epoch and no batch")

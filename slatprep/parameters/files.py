@@ -1,8 +1,8 @@
 """Dataset definitions: a TOML file and options become `BuildParameters`.
 
 The file has a table for each group of `slatprep.parameters`. Its relative paths start from its own
-folder. Options win over the file, and a preset replaces whole groups
-of the file: ``align`` and ``sample``, and the preset ``paper`` also ``normalize``.
+folder. Options win over the file, and a preset replaces whole groups of the file: ``align`` and
+``sample``, and the preset ``paper`` also ``normalize``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from slatprep.parameters import (
     is_split_file,
     percentiles_of,
 )
+from slatprep.storage.documents import adapter_of
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def load_parameters(
         file or option, the key and the value, and what is allowed.
     """
     # Late: pydantic takes a third of a second that `slatprep --help` does not have.
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ValidationError
 
     config = None if config is None else Path(config)
     data = {} if config is None else _read(config)
@@ -115,7 +116,9 @@ def load_parameters(
     # for a path as TOML has them, and still refuses "3" and true for 3.0.
     document = json.dumps(data, default=str)
     try:
-        parameters = TypeAdapter(BuildParameters).validate_json(document, strict=True)
+        parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
+            document, strict=True
+        )
     except ValidationError as error:
         # One line, one repair: a misspelt key first, because it makes another one missing.
         faults = sorted(error.errors(), key=lambda fault: fault["type"] != _UNKNOWN_KEY)
@@ -129,10 +132,10 @@ _Group = TypeVar("_Group", AlignParameters, SampleParameters)
 
 def checked(group: _Group) -> _Group:
     """Return parameters made in Python, checked as those of a file; ConfigError as there."""
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ValidationError
 
     try:
-        found: _Group = TypeAdapter(type(group)).validate_python(asdict(group))
+        found: _Group = adapter_of(type(group)).validate_python(asdict(group))  # type: ignore[arg-type]
     except ValidationError as error:
         raise ConfigError(_explain(error.errors()[0], _Origin(type(group).__name__, {}))) from None
     return found

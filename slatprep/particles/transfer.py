@@ -13,7 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, require_one_of
 from slatprep.export import target
 from slatprep.export.ply import UNITS, VERTEX, write_points
 from slatprep.geometry.voxels import filled, occupancy_of
@@ -70,8 +70,7 @@ def transfer(
     """
     from slatprep.geometry.nearest import Lattice
 
-    if far not in get_args(Far):
-        raise ConfigError(f"far is {far!r}; expected one of {', '.join(get_args(Far))}")
+    require_one_of("far", far, get_args(Far))
     if not max_distance > 0:
         raise ConfigError(f"max_distance is {max_distance}; expected a number above 0")
     distance, used = Lattice(field.voxels).nearest(field.locate(points))

@@ -24,13 +24,12 @@ from slatprep.pipeline.publish import is_marked
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Engine, Number, Place, Share, Verdict
 from slatprep.storage.atomic import writing
-from slatprep.storage.documents import read_bounded
+from slatprep.storage.documents import adapter_of, read_bounded
 from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_beside
 from slatprep.store.record import StageParameters
-from slatprep.store.record_json import adapter_of
-from slatprep.store.records import StoredRecords, manifests_of
+from slatprep.store.records import ERRORS, StoredRecords, manifests_of
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -45,9 +44,6 @@ ALIKE = 0.2
 
 RATES = (0.001, 0.01, 0.05)
 """Shares of wrong assets for which it is said how many assets may be kept."""
-
-FILE = "decoys.json"
-"""In the folder of the store's records, as that is called beside the store; see `file_of`."""
 
 LEAST_TOLD = 0.001
 """Least probability of an error that is kept for an asset."""
@@ -94,7 +90,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class MeasuredErrors:
-    """The errors of a store's alignments, as `FILE` keeps them.
+    """The errors of a store's alignments, as `ERRORS` keeps them.
 
     Attributes
     ----------
@@ -391,7 +387,7 @@ def file_of(store: Place) -> Place:
     local = storage_of(store).local
     name = "" if local is None else local.resolve().name
     own = name and not name.endswith(".zarr")
-    return manifests_of(store) / (f"{name}.{FILE}" if own else FILE)
+    return manifests_of(store) / (f"{name}.{ERRORS}" if own else ERRORS)
 
 
 def measured_errors(store: Place) -> MeasuredErrors | None:
@@ -425,7 +421,7 @@ def writable_file(store: Place) -> Place:
     local = storage_of(file).local
     if local is not None:
         require_beside(local.parent)
-        if os.path.lexists(local) and not is_marked(local, FILE):
+        if os.path.lexists(local) and not is_marked(local, ERRORS):
             raise StoreError(f"{local}: is not slatprep's; expected none: move it away")
     return file
 

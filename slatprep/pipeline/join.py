@@ -24,10 +24,10 @@ from slatprep.pipeline.rows import NextStore, Row, SourceStore
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange, words_of
+from slatprep.storage.documents import adapter_of
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
 from slatprep.store import open_store
-from slatprep.store.record_json import adapter_of
 from slatprep.store.records import build_in, manifests_beside
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most

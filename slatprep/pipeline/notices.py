@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 
@@ -16,6 +15,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import NextStore, Row, moments_of
 from slatprep.readers.contents import ENOUGH, in_words, look_standardised, pooled_moments
 from slatprep.readers.joins import explain_unmatched
+from slatprep.readers.values import guess_in
 from slatprep.records import AssetPair, Normalization, Verdict
 from slatprep.store import Store
 from slatprep.store.record import FailedRecord
@@ -27,9 +27,6 @@ _BESIDE_PIXIE = 0.5
 """Decades beyond Pixie's published ranges within which PixieVerse itself may reach."""
 
 _NAMED = 3
-
-_LOOKS = re.compile(r"the values look like (.+?)(?: \(or |: )")
-"""What refused values look like, in the words of `slatprep.readers.values`."""
 
 _MOST_CLIPPED = 0.25
 """Share of values beyond a range; percentiles that people ask for leave out a tenth or a fifth."""
@@ -89,7 +86,7 @@ def unusual_values(rows: Sequence[Row], failed: Sequence[FailedRecord] = ()) -> 
     made = [row for row in rows if row.spooled]
     told = [(row.asset_id, str(row.columns["unusual"])) for row in made if row.columns["unusual"]]
     if told:
-        refused = Counter(look[1] for one in failed if (look := _LOOKS.search(one.reason)))
+        refused = Counter(guess for one in failed if (guess := guess_in(one.reason)))
         also = (
             f"; {count} refused assets look like {unit}, and {'these' if told[1:] else 'this'} "
             "probably too"

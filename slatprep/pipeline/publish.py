@@ -34,6 +34,7 @@ from slatprep.store.record_json import to_json
 from slatprep.store.records import (
     ASSETS,
     BUILD,
+    ERRORS,
     MAX_BUILD_BYTES,
     SEVERAL,
     build_in,
@@ -46,7 +47,7 @@ from slatprep.store.records import (
 _MARKS = {
     BUILD: b'"slatprep-build-record"',
     ASSETS: b'"slatprep-asset-record"',
-    "decoys.json": b'"refitted"',
+    ERRORS: b'"refitted"',
 }
 """Files beside a store, and what each says at its beginning."""
 
@@ -71,13 +72,13 @@ class Destination:
             raise StoreError(f"{manifests}: expected a local folder for the records")
         path, self._remote = storage_of(self.out).local, storage_of(self.out).remote
         self.store: Place = self.out if path is None else _replaceable(path)
-        if self._manifests is not None:
-            _require_records(self._manifests, storage_of(self.store).local)
-        elif path is not None:
-            require_beside(beside := Path(str(manifests_of(path))))
-            _require_records(beside, path)
-        if path is not None:
-            _require_own(self._manifests or Path(str(manifests_of(path))), path)
+        folder = self._manifests
+        if folder is None and path is not None:
+            require_beside(folder := Path(str(manifests_of(path))))
+        if folder is not None:
+            _require_records(folder, storage_of(self.store).local)
+            if path is not None:
+                _require_own(folder, path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
         self.replacing = False

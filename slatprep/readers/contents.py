@@ -18,7 +18,7 @@ from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, so
 from slatprep.readers.files import refusing
 from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
 from slatprep.records.encoders import LATENTS
-from slatprep.storage.documents import read_document
+from slatprep.storage.documents import adapter_of, read_document
 from slatprep.storage.place import place_of
 
 
@@ -98,8 +98,6 @@ def latent_space(source: SlatSource) -> LatentSpace:
 
 
 def _read_space(path: Place) -> LatentSpace:
-    from pydantic import TypeAdapter
-
     if path.suffix != ".json":
         known = ", ".join(adapter_names("slatprep.latents"))
         raise ConfigError(
@@ -109,7 +107,7 @@ def _read_space(path: Place) -> LatentSpace:
     expected = "encoder, channels, resolution, and mean and std of each channel if they are known"
     with refusing(path, "describes no encoder", expected, ConfigError):
         document = json.dumps(read_document(path, _MAX_BYTES))
-        space: LatentSpace = TypeAdapter(LatentSpace).validate_json(document)
+        space: LatentSpace = adapter_of(LatentSpace).validate_json(document)
     return space
 
 

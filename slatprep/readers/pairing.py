@@ -24,6 +24,9 @@ from slatprep.storage.archives import is_archive
 from slatprep.storage.files import Listing
 from slatprep.storage.place import storage_of
 
+LOOKED_FOR = "; looked for "
+"""What stands, in the problem of a pair, before the names that its files might have had."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Row:
@@ -247,7 +250,7 @@ def _pair_of(
                 transform = _find_one(there, (source.transform,), known, "transform", problems)
                 if transform is None:
                     tried = fill(source.transform, known)
-                    problems.append(f"no transform for id {row.object_id!r}; looked for {tried}")
+                    problems.append(f"no transform for id {row.object_id!r}{LOOKED_FOR}{tried}")
     else:
         problems += _lacking(row, there, "grid", _tried_grids(source, {"id": "{id}"}))
     found = [slat for slat in row.slats if slat.path]
@@ -282,7 +285,7 @@ def _pair_of(
 
 def _lacking(row: _Row, there: _Found, side: str, tried: str) -> Iterator[str]:
     """Say that a side is missing, and whether it has the id in other letters' case."""
-    yield f"no {side} for id {row.object_id!r}; looked for {tried}"
+    yield f"no {side} for id {row.object_id!r}{LOOKED_FOR}{tried}"
     if other := there.cases.get(row.object_id):
         yield f"a {side} is called {other!r}: rename one, or join them with --map"
 

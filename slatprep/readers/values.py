@@ -6,6 +6,7 @@ Where no material has them, the likeliest mistake is named.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,6 +34,8 @@ from slatprep.records import (
     Units,
     to_si,
 )
+
+_GUESS = re.compile(r"the values look like (.+?)(?: \(or |: )")
 
 _PREDICTED = 1.5
 """Half the values of a prediction lie within this; log10 of most densities is above it."""
@@ -90,6 +93,12 @@ def require_plausible(
     if roots.plausibility == "warn":
         return [f'{TOLD}{what}; taken as they are (plausibility = "warn")']
     raise InputError(where, what, f'{advice}; or set plausibility = "warn" in [pixieverse]')
+
+
+def guess_in(reason: str) -> str:
+    """Return what `require_plausible` says that refused values look like; empty if it does not."""
+    found = _GUESS.search(reason)
+    return found[1] if found else ""
 
 
 def require_prediction(

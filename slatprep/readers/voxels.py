@@ -31,7 +31,7 @@ from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
 from slatprep.storage.chunks import array_form, read_chunks
-from slatprep.storage.documents import read_bounded, unique
+from slatprep.storage.documents import adapter_of, read_bounded, unique
 from slatprep.storage.files import Listing
 
 DESCRIPTION = "source.json"
@@ -158,14 +158,12 @@ def _ply_arrays(
 
 @lru_cache(maxsize=4)
 def _parsed(text: bytes, where: str) -> _Description:
-    from pydantic import TypeAdapter
-
     expected = (
         "properties with name, unit and scale, and classes, resolution and aligned where they are "
         "not true, 64, false"
     )
     with files.refusing(where, "does not describe plain voxels", expected, ConfigError):
-        read: _Description = TypeAdapter(_Description).validate_json(text, strict=True)
+        read: _Description = adapter_of(_Description).validate_json(text, strict=True)
         json.loads(text, object_pairs_hook=unique)  # pydantic takes the last of two keys.
         if len({one.name for one in read.properties}) < len(read.properties):
             raise ValueError("a property has two columns")

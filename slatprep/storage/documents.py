@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import chain
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import orjson
 
 from slatprep.records import Place
 from slatprep.storage.place import storage_of
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 _Value = TypeVar("_Value")
 
@@ -67,3 +71,12 @@ def unique(pairs: Sequence[tuple[str, _Value]]) -> dict[str, _Value]:
 def read_document(place: Place, limit: int) -> dict[str, Any]:
     """Read a file that holds one JSON object; see `read_bounded` and `parse_document`."""
     return parse_document(read_bounded(place, limit))
+
+
+@lru_cache(maxsize=16)
+def adapter_of(kind: Any) -> TypeAdapter[Any]:
+    """Return what reads a kind of record, and knows its JSON Schema."""
+    # Late: pydantic takes a third of a second that a command without records does not have.
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)

@@ -13,9 +13,10 @@ from annotated_types import MaxLen, MinLen
 
 from slatprep import records
 from slatprep.parameters import Length, SampleParameters
+from slatprep.storage.documents import adapter_of
 from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT, FORMAT_VERSION
-from slatprep.store.record_json import adapter_of, faults_in
+from slatprep.store.record_json import faults_in
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,12 +16,13 @@ import orjson
 
 from slatprep.errors import StoreError
 from slatprep.records import SourceFile
+from slatprep.storage.documents import adapter_of
 from slatprep.storage.place import is_place
 from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES
 from slatprep.store.record import AssetRecord, BuildRecord, Record
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ValidationError
 
 
 FOLDER = Path(__file__).with_name("schema")
@@ -97,15 +97,6 @@ def build_id_of(head: object, digests: Iterable[tuple[str, bytes]]) -> str:
 def digest_of(text: bytes) -> bytes:
     """Return the SHA-256 of a record's text, by which builds and stores tell it from others."""
     return hashlib.sha256(text).digest()
-
-
-@lru_cache(maxsize=8)
-def adapter_of(kind: Any) -> TypeAdapter[Any]:
-    """Return what reads a kind of record, and knows its JSON Schema."""
-    # Late: pydantic takes a third of a second that a command without records does not have.
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(kind)
 
 
 def _read(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:

@@ -65,7 +65,7 @@ class StoredRecords:
         return self._chunks[chunk][position]
 
 
-BUILD, ASSETS, SEVERAL = "build.json", "assets.jsonl", "assets-*.jsonl"
+BUILD, ASSETS, SEVERAL, ERRORS = "build.json", "assets.jsonl", "assets-*.jsonl", "decoys.json"
 
 MAX_BUILD_BYTES = 32 * 2**20
 """No `build.json` is larger: it lists as many of the assets that could not go in as fit."""

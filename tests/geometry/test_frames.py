@@ -48,7 +48,7 @@ from slatprep.geometry.voxels import (
     voxels_of,
 )
 from slatprep.records import Deformation, Ground
-from slatprep.store.record_json import adapter_of
+from slatprep.storage.documents import adapter_of
 
 numbers = st.floats(-2, 2)
 poses = st.tuples(

@@ -15,9 +15,9 @@ from support.trees import tree
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
-from slatprep.pipeline.decoys import FILE, draw_decoys, measure_errors, measured_errors, told_of
+from slatprep.pipeline.decoys import draw_decoys, measure_errors, measured_errors, told_of
 from slatprep.store import Store, open_store
-from slatprep.store.records import manifests_of
+from slatprep.store.records import ERRORS, manifests_of
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +40,10 @@ def test_decoys_are_of_other_objects_and_are_aligned_once(store):
     assert len(first.decoys) == 3
     assert aligned == [(1, 3), (2, 3), (3, 3)]
     assert all(objects[one.grid] != objects[one.slat] for one in first.decoys)
-    text = (manifests_of(store.path) / FILE).read_bytes()
+    text = (manifests_of(store.path) / ERRORS).read_bytes()
     measure_errors(store, decoys=3, seed=1, progress=progress)
     assert len(aligned) == 3, "they were taken over"
-    assert (manifests_of(store.path) / FILE).read_bytes() == text
+    assert (manifests_of(store.path) / ERRORS).read_bytes() == text
     assert told_of(store) == first.sentences()
 
 
@@ -103,7 +103,7 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     assert "is below 0.1%" in replace(measured, errors={}).of_asset(asset_id)
     assert "is 25.0%" in replace(measured, errors={asset_id: 0.25}).of_asset(asset_id)
 
-    file = manifests_of(store.path) / FILE
+    file = manifests_of(store.path) / ERRORS
     document = json.loads(file.read_bytes())
     file.write_text(json.dumps(document | {"build": "another"}))
     assert told_of(store)[:-1] == measured.sentences()
@@ -133,9 +133,9 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, t
     measured = measured_errors(one)
     assert measured is not None
     assert len(measured.decoys) == len(OBJECTS) // decoys.EVERY
-    assert (manifests_of(one) / FILE).read_bytes() == (manifests_of(two) / FILE).read_bytes()
+    assert (manifests_of(one) / ERRORS).read_bytes() == (manifests_of(two) / ERRORS).read_bytes()
     assert tree(one) == tree(two) == tree(none)
-    assert not (manifests_of(none) / FILE).exists()
+    assert not (manifests_of(none) / ERRORS).exists()
     assert told_of(open_store(none))[0].startswith("not measured; run")
 
 
@@ -177,13 +177,13 @@ def test_a_small_update_measures_nothing_and_a_larger_one_takes_decoys_over(make
     out = tmp_path / "s.zarr"
     dataset = make_dataset(*OBJECTS)
     build_store(dataset.parameters(), out)
-    first, text = measured_errors(out), (manifests_of(out) / FILE).read_bytes()
+    first, text = measured_errors(out), (manifests_of(out) / ERRORS).read_bytes()
     verdicts = open_store(out).column("verdict").tolist()
     dataset.add("gnu", seed=9)
     build_store(dataset.parameters(), out)
     store = open_store(out)
     assert store.column("verdict").tolist()[:-1] == verdicts
-    assert (manifests_of(out) / FILE).read_bytes() == text
+    assert (manifests_of(out) / ERRORS).read_bytes() == text
     assert told_of(store)[-1].startswith("measured before the last update, when there were 6")
     for seed, name in enumerate(("hen", "ibis"), 8):
         dataset.add(name, seed)

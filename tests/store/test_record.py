@@ -15,6 +15,7 @@ from support.made_store import BUILD_ID, GONE, placed
 
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.records import PIXIEVERSE, LatentSpace, Property
+from slatprep.storage.documents import adapter_of
 from slatprep.store import open_store
 from slatprep.store.attributes import (
     RootAttributes,
@@ -26,7 +27,6 @@ from slatprep.store.record import AssetRecord, FailedRecord
 from slatprep.store.record_json import (
     FOLDER,
     RecordError,
-    adapter_of,
     read_asset_record,
     read_build_record,
     to_json,
