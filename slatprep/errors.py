@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 
 
@@ -16,6 +17,33 @@ def in_unicode(text: str) -> str:
     a\udcff.npz
     """
     return text.encode(errors="backslashreplace").decode()
+
+
+def printable(text: str) -> str:
+    r"""Return text with control characters written as JSON escapes.
+
+    Names and categories are not trusted. Line breaks and tabs are kept.
+
+    >>> print(printable("cup" + chr(27) + "[2J"))
+    cup\u001b[2J
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    return f"\\u{code:04x}" if code < 0x10000 else json.dumps(character)[1:-1]
+
+
+def apart_from(name: str, others: Collection[str]) -> str:
+    """Return the name of a row of a table, in quotes where another row has it.
+
+    >>> apart_from("cup", ("all",)), apart_from("all", ("all",))
+    ('cup', '"all"')
+    """
+    return f'"{name}"' if name in others else name
 
 
 def amount(count: int, noun: str, plural: str = "") -> str:

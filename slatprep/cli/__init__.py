@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 
 from slatprep.workers.local import THREAD_VARIABLES
 
@@ -20,6 +21,12 @@ def main() -> None:
     from slatprep.cli.streams import prepare_streams
 
     prepare_streams()
+    if sys.flags.optimize > 1:
+        sys.stderr.write(
+            "slatprep: error: commands are made of docstrings, which `python -OO` and "
+            "PYTHONOPTIMIZE=2 leave out; expected -O at most\n"
+        )
+        raise SystemExit(2)
     from slatprep.cli.commands import slatprep
 
     slatprep(prog_name="slatprep")

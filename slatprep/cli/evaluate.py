@@ -13,6 +13,7 @@ import click
 from slatprep.cli import options
 from slatprep.cli.output import Output, write_csv
 from slatprep.cli.signature import Click, command
+from slatprep.errors import apart_from
 
 if TYPE_CHECKING:
     from slatprep.learn.compare import Comparison
@@ -73,6 +74,7 @@ def evaluate(
     slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
     slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
     """
+    from slatprep.inspect.overview import UNKNOWN
     from slatprep.learn.metrics import OURS, SPREADS, evaluate_store
     from slatprep.learn.published import TABLES, read_scores
 
@@ -83,7 +85,7 @@ def evaluate(
     if picture is not None and picture.suffix.lower() != ".png":
         raise click.BadParameter(f"{picture} does not end in .png", param_hint="--picture")
     folders = _folders_of_grids(grids)
-    others = {
+    published = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
     chosen = _selected(output, predictions, store, split, splits) | {"spread": spread}
@@ -108,10 +110,11 @@ def evaluate(
             )
     else:
         result = evaluate_store(cast("Path", predictions), store, part, **chosen)
-        measures = {name or "(none)": m for name, m in result.categories.items()}
+        baselines = result.baselines
+        others = {UNKNOWN, "all", *baselines}
+        measures = {apart_from(n, others) or UNKNOWN: m for n, m in result.categories.items()}
         measures |= {"all": result.overall}
         ours, what = {OURS: result.overall}, "category"
-        baselines = result.baselines
         problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
         if result.converted:
             output.note(
@@ -128,7 +131,7 @@ def evaluate(
     output.problems(problems, "--json lists them")
     document = vars(result) | {"store": store}
     if beside:
-        document["beside"] = [score for scores in others.values() for score in scores]
+        document["beside"] = [score for scores in published.values() for score in scores]
 
     def show() -> None:
         names = tuple(next(iter(measures.values())).means)
@@ -138,14 +141,14 @@ def evaluate(
             (what, "n", *names),
             [_row_of_scores(name, one) for name, one in (measures | baselines).items()],
         )
-        if TABLES.keys() & others:
+        if TABLES.keys() & published:
             output.note(
                 "note: those beside were measured on PixieVerse's test objects; they compare only "
                 "with predictions of the same objects, normalised by Pixie's ranges (--ranges "
                 "pixie)"
             )
         means = {name: one.means for name, one in ours.items()}
-        for name, scores in others.items():
+        for name, scores in published.items():
             title = TABLES[name][0] if name in TABLES else name
             _show_beside(output, f"Beside {title}", means, scores)
 

@@ -227,10 +227,6 @@ def _picture(store: Store, count: int) -> bytes:
     return sheet_of(store, [store.ids[row] for _, row in sorted(turns)[:count]])
 
 
-_ASKED_FOR = ("license", "cite_as", "date_published")
-"""Optional metadata whose absence Croissant's validator warns of."""
-
-
 @command(context_settings={"show_default": False})
 def describe(
     output: Output,
@@ -263,10 +259,9 @@ def describe(
     if not location:
         local, beside = storage_of(store).local, out.parent if out else Path()
         location = Path(os.path.relpath(local, beside)).as_posix() if local else str(store)
-    missing = [f"--{name.replace('_', '-')}" for name in _ASKED_FOR if not getattr(stated, name)]
-    if missing:
-        output.note(f"catalogues also ask for {', '.join(missing)}")
     told = croissant.Stated(**vars(stated))
+    if told.missing:
+        output.note(f"catalogues also ask for {', '.join(told.missing)}")
     document = croissant.describe(options.opened(store), told, location.rstrip("/"))
     text = croissant.to_json(document)
     if out is None:

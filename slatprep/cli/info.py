@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from slatprep.cli import options
 from slatprep.cli.output import Cell, Output, say, write_csv
 from slatprep.cli.signature import Click, command
+from slatprep.errors import apart_from
 
 if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
@@ -72,12 +73,13 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
 
     medians = attrgetter("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
+    categories = [(apart_from(one.name, (total.name,)), one) for one in overview.categories]
     output.table(
         "Alignments (medians)",
         ("category", *total.verdicts, "confidence", "labels", "fitness", "valid"),
         [
-            (group.name, *group.verdicts.values(), *medians(group))
-            for group in (*overview.categories, total)
+            (name, *group.verdicts.values(), *medians(group))
+            for name, group in (*categories, (total.name, total))
         ],
     )
     unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)
@@ -286,13 +288,18 @@ def stats(
 
 def _show_statistics(output: Output, found: StoreStatistics) -> None:
     kept = sorted(found.categories, key=lambda group: -group.slat.assets)[:_CATEGORIES]
-    groups = [group for group in found.groups if group.by != "category" or group in kept]
+    groups = {"all": found.total} | {f"class {group.name}": group for group in found.classes}
+    groups |= {apart_from(one.name, groups): one for one in found.categories if one in kept}
     chosen = f"{found.assets_chosen:,} of {found.assets:,} assets"
     output.record(f"{chosen}, weighted by {found.weight}", {**found.total.verdicts})
     output.table(
         "Voxels before and after the lookup, and the share that is not annotated",
         ("group", "assets", "before", "share", "none", "after", "share", "none"),
-        [_voxels(group) for group in groups if group.slat.assets or group.field.assets],
+        [
+            (name, *_voxels(own))
+            for name, own in groups.items()
+            if own.slat.assets or own.field.assets
+        ],
     )
     output.table(
         "Properties of all annotated voxels",
@@ -308,13 +315,13 @@ def _show_statistics(output: Output, found: StoreStatistics) -> None:
     )
     for name, whole in found.total.slat.properties.items():
         rows: list[tuple[Cell, ...]] = []
-        for group in groups:
+        for label, group in groups.items():
             before, after = (
                 side.properties[name].log10 or side.properties[name].si
                 for side in (group.field, group.slat)
             )
             if group.slat.voxels:
-                rows.append((_label(group), *_spread(after), before.quantiles["50%"]))
+                rows.append((label, *_spread(after), before.quantiles["50%"]))
         output.table(
             f"{'log10 of ' if whole.log10 else ''}{name}{_unit(whole.unit)}, after the lookup",
             ("group", "mean", "std", "5%", "50%", "95%", "50% before"),
@@ -330,12 +337,7 @@ def _show_statistics(output: Output, found: StoreStatistics) -> None:
 def _voxels(group: GroupStatistics) -> tuple[Cell, ...]:
     before, after = group.field, group.slat
     cells = ((side.voxels, side.share, side.unannotated) for side in (before, after))
-    return (_label(group), after.assets, *(cell for own in cells for cell in own))
-
-
-def _label(group: GroupStatistics) -> str:
-    """Return the label of a group: a category may have the name of a class."""
-    return f"class {group.name}" if group.by == "class" else group.name
+    return (after.assets, *(cell for own in cells for cell in own))
 
 
 def _spread(own: Distribution) -> tuple[Cell, ...]:

@@ -129,10 +129,11 @@ def chosen_store(store: Place | None) -> Place:
     """Return the named store, or else the one that `make align` built last."""
     if store is not None:
         return store
-    built = sorted(Path("data").glob("*.zarr"), key=lambda path: path.stat().st_mtime)
-    if not built:
+    built = (path for path in Path("data").glob("*.zarr") if path.is_dir())
+    newest = max(built, key=lambda path: path.stat().st_mtime, default=None)
+    if newest is None:
         raise click.UsageError("there is no store under data/; name one, or run `make align`")
-    return built[-1]
+    return newest
 
 
 def records_of(store: Place) -> Place | None:

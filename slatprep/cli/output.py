@@ -8,7 +8,6 @@ aligned columns; with ``--json`` standard output is one JSON document.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import sys
 import time
@@ -22,7 +21,7 @@ from typing import Any
 import click
 
 from slatprep.cli.streams import emit
-from slatprep.errors import SlatprepError, in_unicode
+from slatprep.errors import SlatprepError, in_unicode, printable
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
 
@@ -187,24 +186,6 @@ def _for_spreadsheet(value: object) -> object:
 def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
     """Print text through `printable`; all commands print with this function."""
     emit(printable(str(text)), err=err, nl=nl)
-
-
-def printable(text: str) -> str:
-    r"""Return text with control characters written as JSON escapes.
-
-    Names and categories are not trusted. Line breaks and tabs are kept.
-
-    >>> print(printable("cup" + chr(27) + "[2J"))
-    cup\u001b[2J
-    """
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() or c in "\n\t" else _escaped(c) for c in text)
-
-
-def _escaped(character: str) -> str:
-    code = ord(character)
-    return f"\\u{code:04x}" if code < 0x10000 else json.dumps(character)[1:-1]
 
 
 OUTPUT_OPTIONS = (

@@ -44,7 +44,8 @@ def prepare_streams() -> None:
 def emit(text: str, *, err: bool, nl: bool) -> None:
     """Print a text; OutputLostError where standard output does not take it.
 
-    That standard error does not take a text is told when the command ends, by `lost`.
+    What follows after a reader has closed its pipe is dropped, and the command goes on. That
+    standard error does not take a text is told when the command ends, by `lost`.
     """
     number = 2 if err else 1
     if number not in _broken:
@@ -52,11 +53,11 @@ def emit(text: str, *, err: bool, nl: bool) -> None:
             click.echo(text, err=err, nl=nl)
             return
         except OSError as error:
-            if error.errno == errno.EPIPE:
-                raise  # Whoever reads has read enough, as `head` does.
-            _broken[number] = error.strerror or str(error)
             # What is still in the buffer must not fail again when Python ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+            if error.errno == errno.EPIPE:
+                return  # Whoever reads has read enough, as `head` does.
+            _broken[number] = error.strerror or str(error)
     _untold.add(number)
     if not err:
         raise OutputLostError

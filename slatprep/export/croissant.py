@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from datetime import date
 from typing import Any
 
-from slatprep.errors import StoreError
+from slatprep.errors import ConfigError, StoreError, printable
 from slatprep.export.formats import COLUMNS
 from slatprep.records import MATERIAL_CLASSES, PROPERTIES, Contents
 from slatprep.store import Store
@@ -69,12 +71,35 @@ class Stated:
     version: str = "1.0.0"
     date_published: str = ""
 
+    def __post_init__(self) -> None:
+        if self.url and not re.fullmatch(r"https?://\S+", self.url):
+            raise ConfigError(
+                f"url is {self.url!r}; expected a page such as https://example.org/data"
+            )
+        if self.date_published and not _is_day(self.date_published):
+            raise ConfigError(
+                f"date_published is {self.date_published!r}; expected a day such as 2026-01-31"
+            )
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The options of what is not stated though catalogues ask for it."""
+        asked = ("license", "cite_as", "url", "date_published")
+        return tuple(f"--{name.replace('_', '-')}" for name in asked if not getattr(self, name))
+
     @property
     def license_url(self) -> str:
         """The URL of the licence."""
         if not self.license or "://" in self.license:
             return self.license
         return f"https://spdx.org/licenses/{self.license}"
+
+
+def _is_day(text: str) -> bool:
+    try:
+        return date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
 
 
 def describe(store: Store, stated: Stated | None = None, location: str = "") -> dict[str, Any]:
@@ -236,4 +261,4 @@ def _assets(store: Store) -> dict[str, Any]:
 
 def to_json(description: Mapping[str, Any]) -> str:
     """Return a description as the text of a file."""
-    return json.dumps(description, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return printable(json.dumps(description, indent=2, ensure_ascii=False, allow_nan=False) + "\n")

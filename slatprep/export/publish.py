@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep.errors import ConfigError, StoreError, apart_from, printable
 from slatprep.export import croissant, export_store, target
 from slatprep.export.croissant import Stated
 from slatprep.records import USABLE, Place, Verdict
@@ -97,9 +97,7 @@ def publish_store(
                  "kind": "hub", "store": opened.name, "manifest": opened.about.manifest,
                  "files": names}  # fmt: skip
         target.write_index(folder, about, [])
-    asked = ("license", "cite_as", "url", "date_published")
-    missing = tuple(f"--{name.replace('_', '-')}" for name in asked if not getattr(stated, name))
-    return PublishSummary(out, where, assets, len(names), size, missing)
+    return PublishSummary(out, where, assets, len(names), size, stated.missing)
 
 
 def _copy(store: Store, local: Path, to: Path) -> None:
@@ -193,7 +191,7 @@ def card_of(
     ]
     if stated.cite_as:
         parts += ["## Citation", f"```\n{stated.cite_as.replace('`', chr(39))}\n```"]
-    return "\n\n".join(parts) + "\n"
+    return printable("\n\n".join(parts) + "\n")
 
 
 def _table(store: Store, kept: NDArray[np.bool_]) -> Iterator[str]:
@@ -207,7 +205,9 @@ def _table(store: Store, kept: NDArray[np.bool_]) -> Iterator[str]:
     yield "| --- |" + " ---: |" * 8
     names = sorted(set(map(str, columns["category"])))
     for name in names:
-        yield _row(_plain(name) or "(unknown)", columns, columns["category"] == name)
+        yield _row(
+            _plain(apart_from(name, ("all",))) or "(unknown)", columns, columns["category"] == name
+        )
     if len(names) > 1:
         yield _row("all", columns, np.ones(kept.sum(), dtype=bool))
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, needing
 from slatprep.export import formats
 from slatprep.records import COLOURS, MATERIAL_CLASSES, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
@@ -45,13 +45,14 @@ _PITCH = 1.25
 def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> formats.Writer:
     """Return the writer of a USD file for each asset; see `slatprep.export.FORMATS`.
 
-    ConfigError if `options.materials` is less than the number of classes, or usd-core is missing.
+    ConfigError if `options.materials` is less than the number of classes, the size is beyond
+    reason, or usd-core is missing.
     """
     least = len(YIELDING)
     if options.materials < least:
         raise ConfigError(f"materials is {options.materials}; expected {least} or more")
-    if not options.size > 0:
-        raise ConfigError(f"size is {options.size}; expected a length above 0 m")
+    if not 1e-6 <= options.size <= 1e6:  # float32 holds the masses of no others.
+        raise ConfigError(f"size is {options.size:g}; expected a length of 1e-06 to 1e+06 m")
     formats.require_solver_classes(store)
     _pxr("Usd")
     one = partial(write, options.points or "grid", options.size, options.materials)
@@ -228,12 +229,8 @@ def _remarks(entries: Sequence[dict[str, Any]]) -> tuple[str, ...]:
 
 def _pxr(*names: str) -> list[Any]:
     """Import modules of OpenUSD."""
-    try:
+    with needing("USD needs", "usd"):
         return [import_module(f"pxr.{name}") for name in names]
-    except ImportError as error:
-        raise ConfigError(
-            "USD needs the package usd-core; install it with `pip install 'slatprep[usd]'`"
-        ) from error
 
 
 _FINEST = 1e-6

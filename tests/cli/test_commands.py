@@ -166,6 +166,7 @@ def test_store_built_last_is_the_default(demo, monkeypatch):
     elsewhere = demo / "elsewhere"
     (elsewhere / "data").mkdir(parents=True)
     monkeypatch.chdir(elsewhere)
+    (elsewhere / "data" / "gone.zarr").symlink_to(demo / "gone.zarr")
     assert "make align" in refused("info")
     (elsewhere / "data" / "demo.zarr").symlink_to(demo / "demo.zarr")
     run("info", "--json")
@@ -240,6 +241,26 @@ def test_lost_notes_are_told_on_standard_output_and_never_within_json(mixed_buil
     assert json.loads(done.stdout)["command"] == "export"
 
 
-def test_a_reader_that_has_read_enough_is_no_fault(mixed_build):
-    done = shell(f"list {mixed_build.store} --ids", "| head -1")
+def test_a_reader_that_has_read_enough_is_no_fault(mixed_build, tmp_path):
+    store = mixed_build.store
+    done = shell(f"list {store} --ids", "| head -1")
     assert done.stdout.count(os.linesep) == 1 and "rror" not in done.stderr
+    for words, code in (("--verdict good", 0), ("--asset nobody", 2)):
+        reading, writing = os.pipe()
+        os.close(reading)
+        line = f"subset {store} {words} --out {tmp_path}/s.zarr".split()
+        done = subprocess.run(
+            [sys.executable, "-m", "slatprep", *line], stdout=writing, stderr=writing, check=False
+        )
+        os.close(writing)
+        assert done.returncode == code, words
+    assert verify_store(tmp_path / "s.zarr").ok
+
+
+def test_a_python_without_docstrings_is_told_that_the_commands_are_made_of_them():
+    for words in (["--help"], ["info"]):
+        program = [sys.executable, "-OO", "-m", "slatprep", *words]
+        done = subprocess.run(program, capture_output=True, text=True, check=False)
+        assert done.returncode == 2 and done.stdout == ""
+        assert done.stderr.startswith("slatprep: error: ") and "-OO" in done.stderr
+        assert done.stderr.count("\n") == 1

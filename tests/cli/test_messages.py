@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import zarr
 from support.commands import document, refused, run
+from support.made_store import rewrite
+from support.predictions import write_predictions
 from support.rights import BOUND_BY_PERMISSIONS
 from support.synthetic import Dataset
 
@@ -159,7 +161,26 @@ def test_a_misspelt_folder_is_told_with_the_one_meant(make_dataset, tmp_path):
 
 def test_what_catalogues_ask_for_is_named_where_it_is_not_stated(store):
     told = run("describe", store, "--license", "https://spdx.org/licenses/MIT")
-    assert "also ask for --cite-as, --date-published" in told.stderr
+    assert "also ask for --cite-as, --url, --date-published" in told.stderr
+
+
+def test_a_category_with_the_name_of_another_row_is_in_quotes(store, copy, tmp_path):
+    names = ("all", "class jelly", "class jelly", "mean of the training voxels")
+    for row, name in enumerate(names):
+        rewrite(copy, "asset/category", row, name)
+    predictions, table = write_predictions(tmp_path / "p", store), tmp_path / "scores.csv"
+    lines = {
+        "info": ("info", copy),
+        "stats": ("stats", copy),
+        "evaluate": ("evaluate", predictions, "--store", copy, "--split", "all", "--csv", table),
+    }
+    told = {name: run(*line).stdout for name, line in lines.items()}
+    for text in told.values():
+        rows = [line for line in text.splitlines() if line.lstrip().startswith(("all ", '"all" '))]
+        assert {row.split()[0] for row in rows} == {"all", '"all"'}
+    assert '\n"class jelly" ' in told["stats"] and "\nclass jelly " in told["stats"]
+    assert '\n"mean of the training voxels" ' in told["evaluate"]
+    assert table.read_text().count("all") == 2
 
 
 @pytest.mark.parametrize("command", ["list", "subset"])

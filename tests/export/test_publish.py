@@ -110,6 +110,39 @@ def test_a_card_says_what_is_not_known(mixed_build):
     assert "```\n'''me\n```" in linked
 
 
+def test_no_control_character_of_a_category_reaches_a_text(copy):
+    word = "cup\x1b[2J\x9b\u202e\n"
+    rewrite(copy, "asset/category", 0, word)
+    store = open_store(copy)
+    card = card_of(store, Stated(name="a\x85b", cite_as="me\x1b"), "s.zarr", [])
+    text = to_json(describe(store))
+    for made in (card, text):
+        assert all(c.isprintable() or c == "\n" for c in made)
+    assert "cup\\u001b" in card
+    assert json.loads(text)["recordSet"][-1]["data"][0]["assets/category"] == word
+
+
+def test_a_category_called_all_is_told_from_the_row_of_all(copy):
+    rewrite(copy, "asset/category", 0, "all")
+    card = card_of(open_store(copy), Stated(), "s.zarr", [])
+    assert '\n| "all" | 1 | ' in card and "\n| all | 5 | " in card
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--date-published", "2026-99-99"), "'2026-99-99'; expected a day such as 2026-01-31"),
+        (("--date-published", "20260131"), "expected a day such as 2026-01-31"),
+        (("--url", "my page"), "url is 'my page'; expected"),
+        (("--url", "ftp:"), "expected a page such as https://example.org/data"),
+    ],
+)
+def test_what_is_stated_is_what_it_says(words, said, store, tmp_path):
+    assert said in run(store, "--out", tmp_path / "hub", *words, code=2).stderr
+    assert said in commands.refused("describe", store, *words)
+    commands.run("describe", store, "--date-published", "2026-01-31", "--url", "https://a.org/b")
+
+
 @pytest.fixture(scope="module")
 def hub(root: Path) -> Iterator[str]:
     """Serve the datasets as the hub does; return the address."""

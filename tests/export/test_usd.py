@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.commands import run
+from support.commands import refused, run
 from support.exports import index_of
 from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
 
@@ -34,6 +34,14 @@ def exported(mixed_build: Any, tmp_path_factory: pytest.TempPathFactory) -> Path
     told = run("export", mixed_build.store, *words).output
     assert "up to 2 materials an asset: E and nu are those of the store" in told
     return out
+
+
+@pytest.mark.parametrize("size", ["1e308", "1e-300"])
+def test_a_size_whose_masses_no_file_holds_is_refused(size, mixed_build, tmp_path):
+    words = ("--format", "usd", "--size", size, "--out", tmp_path / "usd")
+    assert f"size is {float(size):g}; expected a length" in refused(
+        "export", mixed_build.store, *words
+    )
 
 
 def solid_of(mixed: Dataset, asset_id: str) -> tuple[np.ndarray, np.ndarray]:
