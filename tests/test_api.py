@@ -146,10 +146,7 @@ def test_what_is_no_voxel_set_is_refused_in_words(voxels, said):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        (
-            {"engine": "opend3d"},
-            "AlignParameters: engine: got 'opend3d'; expected 'field'",
-        ),
+        ({"engine": "opend3d"}, "AlignParameters: engine: got 'opend3d'; expected 'field'"),
         ({"scale_bounds": (2, 1)}, r"scale_bounds.0: got 2"),
         ({"radius": -1}, "radius: got -1"),
         ({"method": "zz"}, "SampleParameters: method: got 'zz'; expected 'vote' or 'nearest'"),

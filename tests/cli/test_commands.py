@@ -206,8 +206,7 @@ def shell(words: str, redirected: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    ("words", "redirected"),
-    [("info {}", ">&-"), ("list {} --json", "> /dev/full")],
+    ("words", "redirected"), [("info {}", ">&-"), ("list {} --json", "> /dev/full")]
 )
 def test_lost_output_is_told_on_standard_error(mixed_build, words, redirected):
     if "full" in redirected and not Path("/dev/full").exists():

@@ -20,13 +20,7 @@ from scipy.spatial import cKDTree
 from slatprep.demo import shapes
 from slatprep.demo.asset import make_asset, object_id
 from slatprep.demo.catalogue import CATALOGUE
-from slatprep.demo.difficulty import (
-    LEVELS,
-    QUARTER_TURNS,
-    SAME_SHAPE_LEVELS,
-    draw_frames,
-    generate,
-)
+from slatprep.demo.difficulty import LEVELS, QUARTER_TURNS, SAME_SHAPE_LEVELS, draw_frames, generate
 from slatprep.demo.generated import draw_distortion
 from slatprep.demo.latents import MEAN, STD
 from slatprep.demo.model import MATERIALS, direction, orient, rock, vessel

@@ -21,12 +21,7 @@ from support.synthetic import Dataset
 
 from slatprep import InputError, open_store
 from slatprep.learn.compare import Comparison, compare_methods
-from slatprep.learn.metrics import (
-    METRICS,
-    OURS,
-    average_methods,
-    evaluate_store,
-)
+from slatprep.learn.metrics import METRICS, OURS, average_methods, evaluate_store
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 from slatprep.learn.splits import assign_store
 from slatprep.normalize import PIXIE_RANGES

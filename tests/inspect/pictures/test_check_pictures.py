@@ -23,13 +23,7 @@ from slatprep.errors import StoreError
 from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
 from slatprep.inspect.check import AlignmentCheck, check_alignment, choose_assets
 from slatprep.inspect.pictures import canvas
-from slatprep.inspect.pictures.alignment import (
-    HEIGHT,
-    PANEL,
-    WIDTH,
-    draw_alignment,
-    panels,
-)
+from slatprep.inspect.pictures.alignment import HEIGHT, PANEL, WIDTH, draw_alignment, panels
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours, scene_of, views
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.voxels import View
