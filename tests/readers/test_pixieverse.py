@@ -5,10 +5,11 @@ import json
 
 import numpy as np
 import pytest
-from support.raw_sources import raw_grid
+from support.raw_sources import changed, raw_grid
 
 from slatprep.errors import InputError
 from slatprep.readers import read_field
+from slatprep.records import SourceFile
 
 VOXELS = [[1, 2, 3], [1, 2, 4], [60, 0, 63]]
 MATERIAL = [0, 1, 6]
@@ -42,14 +43,6 @@ MASK = (RAW[..., 3] != 7).astype(np.float32)
 SCORES, IDS = (prediction_of(RAW, scores=scores) for scores in (True, False))
 
 
-def changed(array: np.ndarray, *edits: tuple[object, object]) -> np.ndarray:
-    """Return a copy with other values at places."""
-    made = array.copy()
-    for place, value in edits:
-        made[place] = value
-    return made
-
-
 @pytest.mark.parametrize("grid_dtype", ["f4", ">f4", "f8"])
 @pytest.mark.parametrize("mask_dtype", [None, "bool", "u1", "i8", "f2", "f4", ">f8"])
 def test_raw_grid(make_pair, grid_dtype, mask_dtype):
@@ -57,13 +50,10 @@ def test_raw_grid(make_pair, grid_dtype, mask_dtype):
     order = "F" if mask_dtype == "bool" else "C"
     field = read_field(make_pair(grid=RAW.astype(grid_dtype, order=order), mask=mask))
 
-    assert field.voxels.tolist() == VOXELS
-    assert field.voxels.dtype == np.uint8
-    assert field.material.tolist() == MATERIAL
-    assert field.material.dtype == np.uint8
+    assert (field.voxels.tolist(), field.voxels.dtype) == (VOXELS, np.uint8)
+    assert (field.material.tolist(), field.material.dtype) == (MATERIAL, np.uint8)
     np.testing.assert_array_equal(field.properties, np.array(PROPERTIES, dtype=np.float32))
-    assert field.properties.dtype == np.float32
-    assert field.properties.dtype.isnative
+    assert field.properties.dtype == np.float32 and field.properties.dtype.isnative
     assert np.argwhere(field.occupancy).tolist() == VOXELS
     assert field.warnings == ()
 
@@ -132,31 +122,24 @@ def test_an_odd_grid_or_mask_is_read_as_far_as_it_goes_and_reported(make_pair, c
 
 
 def test_sources_are_named_and_hashed_and_bounds_are_ready_for_json(make_pair):
-    bounds = {
-        "min_bounds": [-0.5, -0.5, -0.25],
-        "voxel_size": 0.015625,
-        "grid_shape": [64, 64, 64],
-        "alpha_weighted": True,
-        "model": "ViT-L",
-    }
+    bounds = {"min_bounds": [-0.5, -0.5, -0.25], "voxel_size": 1 / 64, "grid_shape": [64, 64, 64],
+              "alpha_weighted": True, "model": "ViT-L"}  # fmt: skip
     pair = make_pair(mask=MASK, bounds=bounds)
     field = read_field(pair)
     assert json.loads(json.dumps(field.bounds)) == bounds
-    sources = {source.role: source for source in field.sources}
-    assert list(sources) == ["grid", "mask", "bounds"]
-    for role, path in (("grid", pair.grid), ("mask", pair.mask), ("bounds", pair.bounds)):
-        data, source = path.read_bytes(), sources[role]
-        assert source.sha256 == hashlib.sha256(data).hexdigest()
-        assert (source.size, source.path) == (len(data), f"a/{path.name}")
+    roles = ("grid", "mask", "bounds")
+    for role, source in zip(roles, field.sources, strict=True):
+        path = getattr(pair, role)
+        data, name = path.read_bytes(), f"a/{path.name}"
+        assert source == SourceFile(role, name, len(data), hashlib.sha256(data).hexdigest())
 
 
 def test_unreadable_bounds_are_a_warning(make_pair):
     pair = make_pair(bounds={"scale": 2.0, "extra": np.array(None, dtype=object)})
     field = read_field(pair)
     assert field.bounds == {"scale": 2.0}
-    assert len(field.warnings) == 1
-    assert "pickle" in field.warnings[0]
-
+    (warning,) = field.warnings
+    assert "pickle" in warning
     pair.bounds.write_bytes(b"not a zip")
     field = read_field(pair)
     assert field.bounds is None
@@ -170,24 +153,13 @@ BAD_GRIDS = {
     "class -2": (changed(RAW, (CLASS, -2)), "unknown class -2 at voxel (9, 8, 7)", "-1 to 7"),
     "class 1.5": (changed(RAW, (CLASS, 1.5)), "unknown class 1.5 at voxel (9, 8, 7)", "whole"),
     "class nan": (changed(RAW, (CLASS, np.nan)), "unknown class nan at voxel (9, 8, 7)", "whole"),
-    "nothing annotated": (
-        np.full((64, 64, 64, 4), -1.0),
-        "none of the 262144 occupied voxels is annotated",
-        "class 0 to 6",
-    ),
-    "score nan": (
-        changed(SCORES, ((4, 1, 2, 3), np.nan)),
-        "class score is NaN or infinite at voxel (1, 2, 3)",
-        "finite",
-    ),
-    "predicted nan": (
-        changed(SCORES, ((2, 1, 2, 3), np.nan)),
-        "ratio nan at annotated voxel (1, 2, 3)",
-        "ratio in [0, 0.5], in all but 10% (sample.max_unphysical)",
-    ),
-    "predicted class": (
-        changed(IDS, ((3, 1, 2, 3), 9)), "unknown class 9 at voxel (1, 2, 3)", "-1 to 7"
-    ),
+    "nothing annotated": (np.full((64, 64, 64, 4), -1.0),
+                          "none of the 262144 occupied voxels is annotated", "class 0 to 6"),
+    "score nan": (changed(SCORES, ((4, 1, 2, 3), np.nan)),
+                  "class score is NaN or infinite at voxel (1, 2, 3)", "finite"),
+    "predicted nan": (changed(SCORES, ((2, 1, 2, 3), np.nan)), "ratio nan at annotated voxel (1, 2",
+                      "ratio in [0, 0.5], in all but 10% (sample.max_unphysical)"),
+    "predicted class": (changed(IDS, ((3, 1, 2, 3), 9)), "unknown class 9 at voxel (1, 2", "to 7"),
 }  # fmt: skip
 
 
@@ -249,16 +221,8 @@ def test_values_of_a_voxel_that_is_not_annotated_do_not_matter(make_pair, materi
 BAD_MASKS = {
     "empty": (np.zeros((64, 64, 64), bool), "mask is empty", "occupied voxel"),
     "shape": (np.ones((1, 64, 64, 64), bool), "shape (1, 64, 64, 64)", "shape (64, 64, 64)"),
-    "nan": (
-        changed(MASK, (CLASS[:3], np.nan)),
-        "value nan at voxel (9, 8, 7)",
-        "0 (empty) or 1 (occupied)",
-    ),
-    "255": (
-        changed(MASK, (CLASS[:3], 255)).astype(np.uint8),
-        "value 255 at voxel (9, 8, 7)",
-        "0 (empty) or 1",
-    ),
+    "nan": (changed(MASK, (CLASS[:3], np.nan)), "value nan at voxel (9, 8, 7)", "or 1 (occupied)"),
+    "255": (changed(MASK.astype("u1"), (CLASS[:3], 255)), "value 255 at voxel (9, 8, 7)", "0 (emp"),
     "negative": (changed(MASK, (CLASS[:3], -1)), "value -1.0 at voxel (9, 8, 7)", "0 (empty) or 1"),
     "text": (np.full((64, 64, 64), "1"), "dtype <U1", "boolean"),
 }

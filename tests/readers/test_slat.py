@@ -8,14 +8,14 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from support.raw_sources import COORDS, FEATS
+from support.raw_sources import COORDS, FEATS, changed
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents, read_slat
 from slatprep.readers.contents import latent_space, look_standardised, tell_alone
 from slatprep.readers.slat_files import slat_patterns
-from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace
+from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace, SourceFile
 
 BATCHED = np.concatenate([np.zeros((3, 1), np.int32), COORDS.astype(np.int32)], axis=1)
 
@@ -61,9 +61,11 @@ def test_every_form_is_read_alike(make_pair, form):
     groups = [hdf5_pair(pair, group, **arrays) for group in ("", "a", "slats/a")]
     rounded = ("feats: float64 rounded to float32",) if form == "feats float64" else ()
     for one in (pair, packed, *groups):
-        latents = read_latents(one)
+        latents, data = read_latents(one), one.slat.read_bytes()
         check(latents)
         assert latents.warnings == rounded
+        source = SourceFile("slat", one.slat.name, len(data), hashlib.sha256(data).hexdigest())
+        assert latents.sources == (source,)
 
 
 @pytest.mark.parametrize(
@@ -81,16 +83,6 @@ def test_hdf5_chunks_and_filters(make_pair, options):
     check(read_latents(hdf5_pair(make_pair(), "a", coords=COORDS, feats=feats)))
 
 
-def test_sources(make_pair):
-    pair = make_pair()
-    shared = hdf5_pair(pair, "a", coords=COORDS, feats=FEATS)
-    for each in (pair, shared):
-        (source,) = read_latents(each).sources
-        data = each.slat.read_bytes()
-        assert (source.role, source.path, source.size) == ("slat", each.slat.name, len(data))
-        assert source.sha256 == hashlib.sha256(data).hexdigest()
-
-
 def test_shared_file_is_hashed_again_when_it_changed_in_the_same_tick(make_pair):
     pair = hdf5_pair(make_pair(), "a", coords=COORDS, feats=FEATS)
     before, state = read_latents(pair).sources[0].sha256, pair.slat.stat()
@@ -99,12 +91,6 @@ def test_shared_file_is_hashed_again_when_it_changed_in_the_same_tick(make_pair)
     os.utime(pair.slat, ns=(state.st_atime_ns, state.st_mtime_ns))
     assert pair.slat.stat().st_size == state.st_size
     assert read_latents(pair).sources[0].sha256 != before
-
-
-def _set(array, index, value):
-    changed = array.copy()
-    changed[index] = value
-    return changed
 
 
 OUT = "coordinate ({}) in row {} is out of range"
@@ -117,15 +103,15 @@ BAD_ARRAYS = [
     ({"feats": FEATS.astype(np.int32)}, "dtype <i4", "floating-point"),
     ({"feats": FEATS[:2]}, "3 rows of coords but 2 of feats", "one latent per voxel"),
     ({"coords": COORDS[:0], "feats": FEATS[:0]}, "SLAT is empty", "at least one voxel"),
-    ({"coords": _set(BATCHED, (2, 0), 1)}, "batch index 1 in row 2", "one asset"),
-    ({"coords": _set(BATCHED, (1, 2), -1)}, OUT.format("63, -1, 2", 1), "0..63"),
+    ({"coords": changed(BATCHED, ((2, 0), 1))}, "batch index 1 in row 2", "one asset"),
+    ({"coords": changed(BATCHED, ((1, 2), -1))}, OUT.format("63, -1, 2", 1), "0..63"),
     # It would wrap in uint8.
-    ({"coords": _set(BATCHED, (2, 1), 256)}, OUT.format("256, 63, 63", 2), "0..63"),
-    ({"coords": _set(COORDS, 2, COORDS[0])}, "(0, 0, 0) occurs twice, in rows 0 and 2", "once"),
-    ({"feats": _set(FEATS, (0, 0), -np.inf)}, "feats is -inf in row 0", "finite"),
+    ({"coords": changed(BATCHED, ((2, 1), 256))}, OUT.format("256, 63, 63", 2), "0..63"),
+    ({"coords": changed(COORDS, (2, 0))}, "(0, 0, 0) occurs twice, in rows 0 and 2", "once"),
+    ({"feats": changed(FEATS, ((0, 0), -np.inf))}, "feats is -inf in row 0", "finite"),
     (
-        {"feats": _set(FEATS.astype(np.float64), (2, 7), 1e300)},
-        "feats is 1e+300 in row 2, channel 7",
+        {"feats": changed(FEATS.astype("f8"), ((2, 7), 1e300))},
+        "1e+300 in row 2, channel 7",
         "float32",
     ),
     ({"coords": np.zeros((262145, 3), np.uint8)}, "shape (262145, 3)", "N <= 262144"),
@@ -150,9 +136,8 @@ def test_missing_array_and_group(make_pair):
         np.savez(pair.slat, **arrays)
         with pytest.raises(InputError, match=f"has no array '{missing}'"):
             read_latents(pair)
-        with pytest.raises(
-            InputError, match=f"has no dataset '{missing}'.* datasets coords, feats"
-        ):
+        told = f"has no dataset '{missing}'.* datasets coords, feats"
+        with pytest.raises(InputError, match=told):
             read_latents(hdf5_pair(pair, missing, **arrays))
     with pytest.raises(InputError, match="has no group 'b'"):
         read_latents(replace(hdf5_pair(pair), slat_group="b"))
@@ -211,32 +196,23 @@ def moments_of(feats: np.ndarray) -> LatentMoments:
 @pytest.mark.parametrize("seed", range(20))
 def test_raw_and_standardised_latents_are_told_apart(seed):
     rng = np.random.default_rng(seed)
-    # One asset's channels spread less than a dataset's, and about a mean of its own. Those of most
-    # are told apart, and those that are asked about, as they lie far off, are not mistaken.
-    for spread, off, sure in (
-        (1.0, 0.4, True),
-        (0.6, 0.4, True),
-        (rng.uniform(0.3, 1.1), 0.6, False),
-    ):
+    # Most assets' are told apart, and those that are asked about, far off, are not mistaken.
+    for spread, off in ((1.0, 0.4), (0.6, 0.4), (rng.uniform(0.3, 1.1), 0.6)):
         z = rng.normal(size=(500, 8)) * spread + rng.normal(scale=off, size=8)
         raw = z * np.array(FEATS_STD) + np.array(FEATS_MEAN)
         for feats, right in ((z, True), (raw, False)):
             moments = moments_of(feats)
-            if sure or tell_alone(moments, TRELLIS):
+            if off == 0.4 or tell_alone(moments, TRELLIS):
                 assert look_standardised(moments, TRELLIS) is right
 
 
 def test_trellis_2_has_the_moments_that_microsoft_publishes(tmp_path):
-    for name, mean, std in (
-        ("trellis2", 0.781296, 5.972266),
-        ("trellis2-512", 0.781296, 5.972266),
-        ("trellis2-pbr", 3.501659, 2.665652),
-        ("trellis2-pbr-512", 3.501659, 2.665652),
-    ):
+    for name in ("trellis2", "trellis2-512", "trellis2-pbr", "trellis2-pbr-512"):
         source = SlatSource(tmp_path, encoder=name)
         space = latent_space(source)
         assert (space.encoder, space.channels, len(space.std)) == (name, 32, 32)
-        assert (space.mean[0], space.std[0]) == (mean, std)
+        first = (3.501659, 2.665652) if "pbr" in name else (0.781296, 5.972266)
+        assert (space.mean[0], space.std[0]) == first
         folder = f"{'pbr' if 'pbr' in name else 'shape'}_latents/*_{space.resolution * 16}/"
         assert f"{folder}{{id}}.npz" in slat_patterns(source)
 

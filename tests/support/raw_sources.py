@@ -26,6 +26,14 @@ def raw_grid() -> np.ndarray:
     return grid
 
 
+def changed(array: np.ndarray, *edits: tuple[object, object]) -> np.ndarray:
+    """Return a copy with other values at places."""
+    made = array.copy()
+    for place, value in edits:
+        made[place] = value
+    return made
+
+
 def touch(root: Path, *names: str) -> None:
     for name in names:
         (root / name).parent.mkdir(parents=True, exist_ok=True)
