@@ -43,7 +43,7 @@ from slatprep.demo import nerf
 from slatprep.demo.asset import make_asset
 from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.difficulty import LEVELS
-from slatprep.demo.model import Model, Rng, draw, made_of, orient
+from slatprep.demo.model import DemoObject, Rng, draw, made_of, orient
 from slatprep.demo.shapes import Shape, box, capsule, cone, cylinder, ellipsoid
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform, voxel_centres
@@ -173,9 +173,9 @@ def make_one(seed: int, index: int, level: int) -> Asset:
     )
 
 
-def _model(rng: Rng, name: str) -> Model:
+def _model(rng: Rng, name: str) -> DemoObject:
     parts = [part for stuff, shapes in FLAT[name] for part in made_of(draw(rng, stuff), *shapes)]
-    return Model(name, parts)
+    return DemoObject(name, parts)
 
 
 def _field(occupancy: NDArray[np.bool_], grid: NDArray[np.float32]) -> MaterialField:

@@ -46,13 +46,13 @@ def apart_from(name: str, others: Collection[str]) -> str:
     return f'"{name}"' if name in others else name
 
 
-def amount(count: int, noun: str, plural: str = "") -> str:
+def amount(count: int, noun: str) -> str:
     """Return a count and its noun, in the singular or the plural.
 
-    >>> amount(1, "voxel"), amount(2000, "voxel"), amount(0, "category", "categories")
-    ('1 voxel', '2,000 voxels', '0 categories')
+    >>> amount(1, "voxel"), amount(2000, "voxel"), amount(0, "asset")
+    ('1 voxel', '2,000 voxels', '0 assets')
     """
-    return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+    return f"{count:,} {noun if count == 1 else noun + 's'}"
 
 
 def require_one_of(name: str, value: object, allowed: Iterable[str]) -> None:

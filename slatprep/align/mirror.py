@@ -16,12 +16,7 @@ from slatprep.align.deform import try_out
 from slatprep.align.pair import POLISH_SAMPLES, Pair
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.starts import distinct_starts, so3_starts
-
-MIRRORED = 0.025
-"""From this gain on one side is taken for the other's mirror image.
-
-Of objects that are not mirrored, on real meshes of all levels, the largest was 0.015.
-"""
+from slatprep.records import MIRRORED
 
 REFLECTED_SAMPLES, REFLECTED_TAUS = 60, (3.0, 2.0, 1.0, 1.0)
 WIDE_SAMPLES, WIDE_TAUS, WIDE_STARTS, WIDE_KEPT = 60, (8.0, 5.0, 3.0, 2.0), 240, 6

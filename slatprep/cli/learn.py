@@ -182,6 +182,13 @@ def train(
                 steps=steps,
                 progress=partial(_tell_epoch, output, name),
             )
+    for directory, summary in zip(runs.values(), summaries.values(), strict=True):
+        if summary.diverged_in is not None:
+            output.problem(
+                f"{directory}: the training diverged in epoch {summary.diverged_in}: its loss is "
+                f"no finite number; the weights of epoch {summary.best_epoch} are kept, and a "
+                "smaller --learning-rate into another --out may lead farther"
+            )
     output.made({"runs": summaries}, lambda: _show_training(output, summaries))
     output.note(f"runs:    {', '.join(str(directory) for directory in runs.values())}")
     first = next(iter(summaries.values()))

@@ -12,7 +12,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from slatprep.demo.model import (
-    Model,
+    DemoObject,
     Rng,
     around,
     curve,
@@ -42,7 +42,7 @@ from slatprep.demo.shapes import (
 SIDES = (-1, 1)
 
 
-def tree(rng: Rng, variant: int) -> Model:
+def tree(rng: Rng, variant: int) -> DemoObject:
     """Return a tree in a pot."""
     radius, height = rng.uniform(0.3, 0.4), rng.uniform(0.3, 0.42)
     parts = pot(rng, radius, height, draw(rng, "ceramic"), draw(rng, "soil"))
@@ -59,10 +59,10 @@ def tree(rng: Rng, variant: int) -> Model:
         parts += made_of(wood, capsule(root, tip, 0.035))
         parts += made_of(leaf, ellipsoid(tip, size, orient(angle)))
     parts += made_of(leaf, ellipsoid(spine[3] + vec(0, 0, 0.2), (0.3, 0.26, 0.24)))
-    return Model("tree", parts)
+    return DemoObject("tree", parts)
 
 
-def flowers(rng: Rng, variant: int) -> Model:
+def flowers(rng: Rng, variant: int) -> DemoObject:
     """Return flowers in a vase with water."""
     belly, neck, height = rng.uniform(0.26, 0.33), rng.uniform(0.13, 0.17), rng.uniform(0.6, 0.75)
     wall = 0.045
@@ -93,10 +93,10 @@ def flowers(rng: Rng, variant: int) -> Model:
             frame = axes @ orient(2.0 * np.pi * j / petals)
             centre = head + 0.14 * frame[:, 0] + 0.015 * frame[:, 2]
             parts += made_of(petal, ellipsoid(centre, (0.11, 0.07, 0.035), frame))
-    return Model("flowers in a vase", parts)
+    return DemoObject("flowers in a vase", parts)
 
 
-def shrub(rng: Rng, variant: int) -> Model:
+def shrub(rng: Rng, variant: int) -> DemoObject:
     """Return a shrub of several leaf clusters on a patch of soil."""
     wood, leaf, young, soil = (draw(rng, k) for k in ("wood", "leaf", "leaf", "soil"))
     parts = made_of(soil, dome((0, 0, 0), (0.5, 0.42, 0.13)))
@@ -108,10 +108,10 @@ def shrub(rng: Rng, variant: int) -> Model:
         size = rng.uniform(0.15, 0.24) * vec(1.1, 0.95, 0.8)
         parts += made_of(wood, capsule((0, 0, 0.05), tip, 0.035))
         parts += made_of(young if k % 3 == 0 else leaf, ellipsoid(tip, size, orient(angle, 0.4)))
-    return Model("shrub", parts)
+    return DemoObject("shrub", parts)
 
 
-def grass(rng: Rng, variant: int) -> Model:
+def grass(rng: Rng, variant: int) -> DemoObject:
     """Return blades of grass on a sod, with a stone."""
     blade = draw(rng, "grass")
     half = vec(0.62, rng.uniform(0.4, 0.5), 0.1)
@@ -125,10 +125,10 @@ def grass(rng: Rng, variant: int) -> Model:
     spot = vec(*rng.uniform(-0.5, 0.5, 2) * half[:2], 0.15)
     stone = rock(rng, spot, (0.2, 0.15, 0.13))
     parts += made_of(draw(rng, "stone"), stone)
-    return Model("grass", parts)
+    return DemoObject("grass", parts)
 
 
-def fruit(rng: Rng, variant: int) -> Model:
+def fruit(rng: Rng, variant: int) -> DemoObject:
     """Return, in turn, an apple, a bunch of bananas or a pear."""
     flesh, wood = draw(rng, "flesh"), draw(rng, "wood")
     if variant % 3 == 1:
@@ -141,7 +141,7 @@ def fruit(rng: Rng, variant: int) -> Model:
             fat = vec(0.07, 0.11, 0.13, 0.135, 0.12, 0.08) * (1.0 + 0.05 * k)
             parts += made_of(flesh, *curve(along, fat))
             parts += made_of(wood, sphere(along[-1], 0.06))
-        return Model("bananas", parts)
+        return DemoObject("bananas", parts)
     leaf = draw(rng, "leaf")
     if variant % 3 == 2:
         lean = rng.normal(0.0, 0.06, 2)
@@ -161,10 +161,10 @@ def fruit(rng: Rng, variant: int) -> Model:
     parts += made_of(wood, *curve(stalk, (0.04, 0.035)))
     frame = orient(rng.uniform(0.0, 2.0 * np.pi), -0.35)
     parts += made_of(leaf, ellipsoid(bent + 0.2 * frame[:, 0], (0.22, 0.11, 0.03), frame))
-    return Model(name, parts)
+    return DemoObject(name, parts)
 
 
-def duck(rng: Rng, variant: int) -> Model:
+def duck(rng: Rng, variant: int) -> DemoObject:
     """Return a rubber duck, looking along x."""
     body, beak, eye = draw(rng, "rubber"), draw(rng, "plastic"), draw(rng, "stone")
     long, wide, tall = rng.uniform(0.52, 0.6), rng.uniform(0.38, 0.44), rng.uniform(0.33, 0.38)
@@ -185,10 +185,10 @@ def duck(rng: Rng, variant: int) -> Model:
         parts += made_of(beak, ellipsoid(bill, (0.17, 0.15, size), look))
     for side in SIDES:
         parts += made_of(eye, sphere(at + head * look @ vec(0.8, side * 0.45, 0.38), 0.055))
-    return Model("rubber duck", parts)
+    return DemoObject("rubber duck", parts)
 
 
-def ball(rng: Rng, variant: int) -> Model:
+def ball(rng: Rng, variant: int) -> DemoObject:
     """Return, in turn, a ball with a painted half, a plain one, an oval one with laces."""
     skin, paint = draw(rng, "rubber"), draw(rng, "plastic")
     if variant % 3 == 2:
@@ -199,13 +199,13 @@ def ball(rng: Rng, variant: int) -> Model:
         across = [capsule((x, -0.09, top), (x, 0.09, top), 0.04) for x in (-0.16, 0, 0.16)]
         parts += made_of(lace, along, *across)
         # Half a turn about z leaves it unchanged.
-        return Model("oval ball", parts, symmetric=True)
+        return DemoObject("oval ball", parts, symmetric=True)
     coats = ((half_space((0, 0, 0), direction(rng)), paint),) if variant % 3 == 0 else ()
     name = "half-painted ball" if coats else "plain ball"
-    return Model(name, [Part(sphere((0, 0, 0), 0.5), skin, coats)], symmetric=True)
+    return DemoObject(name, [Part(sphere((0, 0, 0), 0.5), skin, coats)], symmetric=True)
 
 
-def soda_can(rng: Rng, variant: int) -> Model:
+def soda_can(rng: Rng, variant: int) -> DemoObject:
     """Return a can, every second one dented and with an open tab."""
     metal, drink = draw(rng, "aluminium"), draw(rng, "water")
     r, h = rng.uniform(0.25, 0.3), rng.uniform(0.9, 1.05)
@@ -227,10 +227,10 @@ def soda_can(rng: Rng, variant: int) -> Model:
         tab = orient(rng.uniform(0.0, 2.0 * np.pi), -0.6)
         lug = box(vec(0, 0, h + 0.04) + 0.06 * tab[:, 0], (0.12, 0.06, 0.025), tab, 0.02)
         parts += made_of(draw(rng, "aluminium"), lug)
-    return Model("dented can" if dented else "soda can", parts, symmetric=not dented)
+    return DemoObject("dented can" if dented else "soda can", parts, symmetric=not dented)
 
 
-def crate(rng: Rng, variant: int) -> Model:
+def crate(rng: Rng, variant: int) -> DemoObject:
     """Return a crate with ribs, every second one with a latch and a raised lid."""
     frame, panel = draw(rng, "steel"), draw(rng, "aluminium")
     half = vec(0.5, rng.uniform(0.34, 0.42), rng.uniform(0.24, 0.31))
@@ -242,15 +242,15 @@ def crate(rng: Rng, variant: int) -> Model:
     for side in SIDES:
         parts += made_of(frame, box((0, side * (half[1] - 0.03), 0), (0.05, 0.03, half[2])))
     if variant % 2 == 0:
-        return Model("metal crate", parts, symmetric=True)
+        return DemoObject("metal crate", parts, symmetric=True)
     lid = orient(0.0, -0.12)
     parts += made_of(panel, box((-0.04, 0, half[2] + 0.09), (0.52, half[1], 0.035), lid))
     latch = vec(half[0] + 0.03, rng.uniform(-0.6, 0.6) * half[1], 0.3 * half[2])
     parts += made_of(draw(rng, "steel"), box(latch, (0.05, 0.07, 0.09), rounding=0.02))
-    return Model("crate with a lid", parts)
+    return DemoObject("crate with a lid", parts)
 
 
-def sand(rng: Rng, variant: int) -> Model:
+def sand(rng: Rng, variant: int) -> DemoObject:
     """Return, in turn, a sand castle or a bucket of sand with a shovel."""
     dry, plastic = draw(rng, "sand"), draw(rng, "plastic")
     if variant % 2 == 1:
@@ -261,7 +261,7 @@ def sand(rng: Rng, variant: int) -> Model:
         grip, across = top + 0.75 * lean[:, 2], 0.14 * lean[:, 0]
         parts += made_of(draw(rng, "wood"), capsule(top, grip, 0.045))
         parts += made_of(plastic, capsule(grip - across, grip + across, 0.045))
-        return Model("bucket of sand", parts)
+        return DemoObject("bucket of sand", parts)
     wet = draw(rng, "sand")
     parts = made_of(dry, dome((0, 0, 0), (0.75, rng.uniform(0.5, 0.65), 0.22)))
     places = vec(-0.32, -0.1, 0), vec(0.05, 0.22, 0), vec(0.34, -0.08, 0)
@@ -278,10 +278,10 @@ def sand(rng: Rng, variant: int) -> Model:
     for a, b in pairwise(places):
         turn = orient(float(np.arctan2(b[1] - a[1], b[0] - a[0])))
         parts += made_of(wet, box(0.5 * (a + b) + vec(0, 0, 0.15), (0.24, 0.06, 0.16), turn))
-    return Model("sand castle", parts)
+    return DemoObject("sand castle", parts)
 
 
-def snowman(rng: Rng, variant: int) -> Model:
+def snowman(rng: Rng, variant: int) -> DemoObject:
     """Return a snowman with stick arms, a carrot and a hat, on a patch of mud."""
     snow, stick, hat = draw(rng, "snow"), draw(rng, "wood"), draw(rng, "foam")
     r = vec(0.36, 0.27, 0.19) * rng.uniform(0.92, 1.08, 3)
@@ -308,17 +308,17 @@ def snowman(rng: Rng, variant: int) -> Model:
     for height in (-0.08, 0.08):
         where = balls[1] + vec(np.sqrt(r[1] ** 2 - height**2), 0, height)
         parts += made_of(coal, sphere(where, 0.04))
-    return Model("snowman", parts)
+    return DemoObject("snowman", parts)
 
 
-def jello(rng: Rng, variant: int) -> Model:
+def jello(rng: Rng, variant: int) -> DemoObject:
     """Return a jello block on a plate, in turn with cherry and spoon or without."""
     flesh, plate = draw(rng, "jello"), draw(rng, "ceramic")
     side, height = rng.uniform(0.27, 0.33), rng.uniform(0.16, 0.22)
     parts = made_of(plate, vessel(0.0, 0.12, 0.4, 0.62, 0.06, floor=0.06))
     parts += made_of(flesh, box((0, 0, 0.04 + height), (side, side, height), rounding=0.06))
     if variant % 2 == 1:
-        return Model("jello block", parts, symmetric=True)
+        return DemoObject("jello block", parts, symmetric=True)
     cherry = vec(0.4 * side, -0.3 * side, 0.1 + 2 * height)
     parts += made_of(draw(rng, "flesh"), sphere(cherry, 0.1))
     twig = cherry + around(rng.uniform(0.0, 2.0 * np.pi), 0.1, 0.24)
@@ -326,10 +326,10 @@ def jello(rng: Rng, variant: int) -> Model:
     bowl, grip = vec(0.1, side + 0.13, 0.13), vec(0.7, side + 0.2, 0.2)
     spoon = ellipsoid(bowl, (0.14, 0.085, 0.035)), capsule(bowl + vec(0.08, 0, 0), grip, 0.026)
     parts += made_of(draw(rng, "steel"), *spoon)
-    return Model("jello with a cherry", parts)
+    return DemoObject("jello with a cherry", parts)
 
 
-def rocks(rng: Rng, variant: int) -> Model:
+def rocks(rng: Rng, variant: int) -> DemoObject:
     """Return a heap of stones, one of them mossy."""
     stone, moss = draw(rng, "stone"), draw(rng, "leaf")
     parts = made_of(draw(rng, "sand"), dome((0, 0, 0), (0.68, 0.52, 0.1)))
@@ -339,10 +339,10 @@ def rocks(rng: Rng, variant: int) -> Model:
         place = around(start + 2.1 * k, 0.32 if k < 3 else 0.08, 0.18 if k < 3 else 0.44)
         coats = ((half_space(place, (0.2, 0.1, 1.0)), moss),) if k == 3 else ()
         parts.append(Part(rock(rng, place, size), draw(rng, "stone") if k else stone, coats))
-    return Model("rocks", parts)
+    return DemoObject("rocks", parts)
 
 
-def water(rng: Rng, variant: int) -> Model:
+def water(rng: Rng, variant: int) -> DemoObject:
     """Return a glass of water, in turn with straw and lemon or without."""
     glass, wet = draw(rng, "glass"), draw(rng, "water")
     foot, rim, h = rng.uniform(0.22, 0.27), rng.uniform(0.3, 0.36), rng.uniform(0.8, 0.95)
@@ -352,17 +352,17 @@ def water(rng: Rng, variant: int) -> Model:
     parts = made_of(glass, vessel(0.0, h, foot, rim, wall, floor=1.6 * wall))
     parts += made_of(wet, cone((0, 0, wall), (0, 0, level), foot - 0.5 * wall, radius))
     if variant % 2 == 1:
-        return Model("glass of water", parts, symmetric=True)
+        return DemoObject("glass of water", parts, symmetric=True)
     angle = rng.uniform(0.0, 2.0 * np.pi)
     straw = around(angle, rim * 0.75, h + 0.05)
     bent = [around(angle + 3.14, 0.08, 0.12), straw, straw + around(angle, 0.22, 0.14)]
     parts += made_of(draw(rng, "plastic"), *curve(bent, (0.035, 0.035)))
     side, thickness = around(angle + 1.7, rim, h), 0.03 * orient(angle + 1.7)[:, 1]
     parts += made_of(draw(rng, "flesh"), cylinder(side - thickness, side + thickness, 0.15))
-    return Model("glass with a straw", parts)
+    return DemoObject("glass with a straw", parts)
 
 
-CATALOGUE: dict[str, Callable[[Rng, int], Model]] = {
+CATALOGUE: dict[str, Callable[[Rng, int], DemoObject]] = {
     "tree": tree,
     "flowers": flowers,
     "shrubs": shrub,

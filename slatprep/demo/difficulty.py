@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slatprep.demo.generated import Distortion, Warp, draw_distortion
+from slatprep.demo.generated import Distortion, Waves, draw_distortion
 from slatprep.demo.model import Array, Rng, direction
 from slatprep.demo.shapes import Solid, bounding_box
 from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform
@@ -105,7 +105,7 @@ class Frames:
 
     pixieverse: Pose
     slat: Pose
-    warp: Warp | None
+    warp: Waves | None
     distortion: Distortion | None = None
 
     def transform(self) -> Array:
@@ -144,7 +144,7 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
     `quarter` (3, 3) is the quarter turn of the PixieVerse side; the SLAT side stands upright.
     """
     middle = solid.extent.mean(axis=0)
-    warp = Warp.draw(rng, difficulty.warp, (0.7, 1.3)) if difficulty.warp else None
+    warp = Waves.draw(rng, difficulty.warp, (0.7, 1.3)) if difficulty.warp else None
     room = _FULL - 2.0 * warp.reach if warp else _FULL
     slat_scale = room / float((solid.extent[1] - solid.extent[0]).max())
     full = _FULL - 2.0 * difficulty.room * VOXEL_SIZE

@@ -29,7 +29,7 @@ _EDGE = 4.0
 
 
 @dataclass(frozen=True)
-class Warp:
+class Waves:
     """A smooth displacement: a sum of plane sine waves.
 
     ``amplitude`` and ``wave`` are (W, 3), in units of the points and radians
@@ -92,7 +92,7 @@ class Distortion:
         Largest edge of that box.
     proportions : ndarray of float64, shape (3,)
         Stretch of the generated shape along each axis of the object.
-    waves : Warp
+    waves : Waves
         The sine waves, in sizes of the object.
     away : ndarray of float64, shape (3,)
         Unit vector that points away from the image's camera.
@@ -103,7 +103,7 @@ class Distortion:
     middle: Array
     size: float
     proportions: Array
-    waves: Warp
+    waves: Waves
     away: Array
     slope: float
 
@@ -112,7 +112,7 @@ class Distortion:
         q = (points - self.middle) / self.size
         return np.asarray(self.middle + self.size * (q + self.bend(q)) / self.proportions)
 
-    def inverse(self, points: Array, iterations: int = 40) -> Array:
+    def inverse(self, points: Array) -> Array:
         """Map points (P, 3) of the object to the generated shape by fixed-point iteration.
 
         The bend is a contraction by construction: each step multiplies the error by at most
@@ -120,7 +120,7 @@ class Distortion:
         """
         target = self.proportions * (points - self.middle) / self.size
         q = target
-        for _ in range(iterations):
+        for _ in range(40):
             q = target - self.bend(q)
         return np.asarray(self.middle + self.size * q)
 
@@ -139,7 +139,7 @@ def _growth(q: Array, away: Array) -> Array:
     return np.asarray(1.0 + np.tanh(_EDGE * (q @ away)) / 3.0)
 
 
-def _slope(waves: Warp, away: Array) -> float:
+def _slope(waves: Waves, away: Array) -> float:
     """Bound the spectral norm of a bend's derivative in the cube of half edge `_REACH`.
 
     The norm is computed on a lattice; the second derivative bounds its change between the points.
@@ -168,7 +168,7 @@ def draw_distortion(rng: Rng, extent: Array, bend: float) -> Distortion:
     """
     stretch = np.ones(3)
     stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*_WRONG)
-    waves = Warp.draw(rng, bend, (0.6, 1.1))
+    waves = Waves.draw(rng, bend, (0.6, 1.1))
     # The image is taken from somewhere around the object, a little above it or below.
     angle, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.3, 0.5)
     away = np.array([-np.cos(angle), -np.sin(angle), -height])

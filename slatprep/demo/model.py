@@ -63,7 +63,7 @@ def draw(rng: Rng, name: str) -> Stuff:
 
 
 @dataclass(frozen=True)
-class Model:
+class DemoObject:
     """An object of the demo.
 
     ``symmetric`` is true if several placements have the same geometry, whatever the materials.

@@ -6,13 +6,13 @@ import functools
 import math
 import operator
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
-from slatprep.judge import THRESHOLDS, mirror_gain_of, verdict_of
+from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.records import Place, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset, open_store
@@ -152,26 +152,18 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     asset = store.asset(name)
     radius = store.about.build.parameters.align.radius
     valid_share, differs = recompute_annotation(asset)
-    alignment = StoredRecords(store).read(asset.index).alignment
+    record = StoredRecords(store).read(asset.index)
+    alignment, judgement = record.alignment, record.judgement
     quality = measure_quality(asset.field, asset.latents, asset.transform, radius, alignment.ground)
     columns = asset.columns
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
         for name in _QUALITY
     ]
-    same_fit = all(figure.ok for figure in figures)
-    verdict, reasons = verdict_of(
-        quality,
-        valid_share,
-        float(columns["ambiguity"]),
-        len(alignment.open_placements),
+    if not all(figure.ok for figure in figures):
         # The probabilities were computed for the stored fit and hold for no other.
-        same_object=float(columns["same_object"]) if same_fit else math.nan,
-        right_placement=float(columns["right_placement"]) if same_fit else math.nan,
-        expected_accuracy=float(columns["expected_accuracy"]),
-        contradicted=bool(columns["contradicted"]),
-        mirrored=mirror_gain_of(alignment),
-    )
+        judgement = replace(judgement, same_object=math.nan, right_placement=math.nan)
+    verdict, reasons = verdict_of(replace(alignment, quality=quality), judgement, valid_share)
 
     def stored(name: str, settled: bool = False) -> Figure:
         return Figure(name, float(columns[name]), float(columns[name]), 0, settled)

@@ -8,7 +8,6 @@ from slatprep.judge.verdict import (
     contradicted,
     judge,
     merged,
-    mirror_gain_of,
     verdict_of,
     voxel_confidence,
 )
@@ -19,7 +18,6 @@ __all__ = [
     "judge",
     "measure_ambiguity",
     "merged",
-    "mirror_gain_of",
     "verdict_of",
     "voxel_confidence",
 ]

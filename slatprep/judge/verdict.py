@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from slatprep.judge.ambiguity import measure_ambiguity
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
+    MIRRORED,
     Alignment,
     Annotation,
     Judgement,
@@ -52,7 +53,7 @@ class Thresholds:
     good_accuracy: float = 0.75
     good_valid_share: float = 0.8
     good_ambiguity: float = 0.05
-    good_mirrored: float = 0.025
+    good_mirrored: float = MIRRORED
     good_fitness: float = 0.8
     failed_fitness: float = 0.65
 
@@ -100,7 +101,7 @@ def judge(
         How likely the class of each SLAT voxel is right, as `voxel_confidence` says.
     """
     from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT
-    from slatprep.judge.confidence import causes_of_doubt, class_confidence
+    from slatprep.judge.confidence import class_confidence
     from slatprep.judge.evidence import evidence_of, surroundings_of
 
     ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters)
@@ -114,33 +115,17 @@ def judge(
     valid = annotation.valid
     likely = class_confidence(around, same * placed, valid)
     expected = float(likely[valid].mean(dtype=np.float64)) if valid.any() else 0.0
-    verdict, reasons = verdict_of(
-        alignment.quality,
-        float(valid.mean()),
-        ambiguity.material_share,
-        len(alignment.open_placements),
-        same,
-        placed,
-        expected,
-        next(iter(causes_of_doubt(evidence))),
-        mirrored=mirror_gain_of(alignment),
-    )
-    judgement = Judgement(
+    found = Judgement(
         ambiguity,
-        verdict,
-        reasons,
+        Verdict.GOOD,
         confidence=same * placed,
         expected_accuracy=expected,
         same_object=same,
         right_placement=placed,
         evidence=tuple(evidence.tolist()),
     )
-    return judgement, likely
-
-
-def mirror_gain_of(alignment: Alignment) -> float:
-    """Return how much better the sides fit once one is mirrored; NaN where that is not known."""
-    return math.nan if alignment.figures is None else alignment.figures.mirrored
+    verdict, reasons = verdict_of(alignment, found, float(valid.mean()))
+    return replace(found, verdict=verdict, reasons=reasons), likely
 
 
 def contradicted(judgement: Judgement) -> Judgement:
@@ -213,42 +198,19 @@ def voxel_confidence(
 
 
 def verdict_of(
-    quality: Quality,
-    valid_share: float,
-    ambiguity: float = 0.0,
-    ties: int = 0,
-    same_object: float = math.nan,
-    right_placement: float = math.nan,
-    expected_accuracy: float = math.nan,
-    cause: str = "",
-    contradicted: bool = False,
-    mirrored: float = math.nan,
+    alignment: Alignment, judgement: Judgement, valid_share: float
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Say what an alignment is worth, and why.
 
     Parameters
     ----------
-    quality : Quality
-        How well the two surfaces lie on each other; it decides where no probability is known.
+    alignment : Alignment
+        How well the two surfaces lie on each other, what ties, and what mirroring would gain.
+    judgement : Judgement
+        Its figures; verdict and reasons are not looked at. Where its probabilities are NaN, the
+        fitness decides.
     valid_share : float
         Share of SLAT voxels that got an annotation, 0..1.
-    ambiguity : float
-        Share of SLAT voxels whose class depends on the choice among ties, 0..1.
-    ties : int
-        How many placements tie with the one chosen, and nothing chose among them.
-    same_object : float
-        Probability that both sides show the same object; NaN where it is not known.
-    right_placement : float
-        Probability that the placement is right if they do; NaN where it is not known.
-    expected_accuracy : float
-        Expected share of right labels among the valid ones; NaN where it is not known.
-    cause : str
-        What speaks most against the same object: ``shape`` or ``roughness``; empty where
-        that is not known.
-    contradicted : bool
-        Whether the latents of the asset contradict its labels.
-    mirrored : float
-        How much better the two sides fit once one is mirrored; NaN where that is not known.
 
     Returns
     -------
@@ -257,22 +219,24 @@ def verdict_of(
     reasons : tuple of str
         What kept it from being good; empty where it is.
     """
-    limits = THRESHOLDS
+    limits, quality = THRESHOLDS, alignment.quality
+    same_object, right_placement = judgement.same_object, judgement.right_placement
+    ambiguity, ties = judgement.ambiguity.material_share, len(alignment.open_placements)
+    # Among placements that tie nobody has chosen yet: any of them may be right.
+    tied = ties > 0 and ambiguity > limits.good_ambiguity
     reasons: list[str] = []
     if math.isnan(same_object * right_placement):
         fitnesses = quality.fitness, quality.fitness_backward
         failed = any(fitness < limits.failed_fitness for fitness in fitnesses)
         reasons += _low_fitness(quality, f"(good needs {limits.good_fitness:.0%})")
     else:
-        # Among placements that tie nobody has chosen yet: any of them may be right.
-        tied = ties > 0 and ambiguity > limits.good_ambiguity
         wrong = right_placement < limits.failed_confidence and not tied
         failed = same_object < limits.failed_confidence or wrong
         if same_object * right_placement < limits.good_confidence:
-            reasons += _doubts(quality, same_object, right_placement, wrong, cause)
-    if expected_accuracy < limits.good_accuracy:
+            reasons += _doubts(quality, judgement, wrong)
+    if judgement.expected_accuracy < limits.good_accuracy:
         reasons.append(
-            f"only {expected_accuracy:.1%} of the labels can be expected to be right "
+            f"only {judgement.expected_accuracy:.1%} of the labels can be expected to be right "
             f"(good needs {limits.good_accuracy:.0%})"
         )
     if valid_share < limits.good_valid_share:
@@ -280,32 +244,36 @@ def verdict_of(
             f"only {valid_share:.1%} of the SLAT voxels found an annotation "
             f"(good needs {limits.good_valid_share:.0%})"
         )
-    if ties and ambiguity > limits.good_ambiguity:
+    if tied:
         others = "another placement fits" if ties == 1 else f"{ties} other placements fit"
         reasons.append(
             f"{others} about as well and would change the class of {ambiguity:.1%} of the "
             f"voxels (good needs {limits.good_ambiguity:.0%})"
         )
+    mirrored = math.nan if alignment.figures is None else alignment.figures.mirrored
     # Of another object nobody can tell.
     if mirrored > limits.good_mirrored and not same_object < limits.failed_confidence:
         reasons.append(
             "the annotation is a mirror image of its object, left for right: mirrored, it fits "
             f"better by {mirrored:.3f} in score (good needs at most {limits.good_mirrored:g})"
         )
-    if contradicted:
+    if judgement.contradicted:
         reasons.append(_CONTRADICTED)
     if failed:
         return Verdict.FAILED, tuple(reasons)
     return (Verdict.DOUBTFUL if reasons else Verdict.GOOD), tuple(reasons)
 
 
-def _doubts(
-    quality: Quality, same_object: float, right_placement: float, wrong: bool, cause: str
-) -> list[str]:
+def _doubts(quality: Quality, judgement: Judgement, wrong: bool) -> list[str]:
     """Say which of the two questions takes the confidence away, the worse one first."""
+    from slatprep.judge.confidence import causes_of_doubt
+
     limits, sure = THRESHOLDS, ("perhaps", "probably")
+    same_object, right_placement = judgement.same_object, judgement.right_placement
     good = f"(good needs {limits.good_confidence:.0%} for object and placement together)"
-    because = f": {_WORDS[cause]}" if cause else ""
+    because = ""
+    if judgement.evidence:
+        because = f": {_WORDS[next(iter(causes_of_doubt(np.array(judgement.evidence))))]}"
     another = sure[same_object < limits.failed_confidence]
     of_object = (
         f"{another} another object: the two sides show the same one with a probability of "

@@ -36,7 +36,7 @@ from slatprep.records import (
 )
 from slatprep.sample import lattice_of, sample
 
-FOLDS = 5
+PARTS = 5
 """Parts of a dataset, by object, each judged by a model of the others."""
 
 DECISIVE = 0.95
@@ -161,9 +161,9 @@ class Reliability:
     least_gain: float
 
 
-def fold_of(object_id: str) -> int:
-    """Return the part of the dataset, 0..FOLDS - 1, that an object belongs to."""
-    return int(hashlib.sha256(object_id.encode()).hexdigest()[:8], 16) % FOLDS
+def part_of(object_id: str) -> int:
+    """Return the part of the dataset, 0..PARTS - 1, that an object belongs to."""
+    return int(hashlib.sha256(object_id.encode()).hexdigest()[:8], 16) % PARTS
 
 
 def moments_of(
@@ -180,18 +180,18 @@ def moments_of(
 
 
 def fit_models(moments: Iterable[tuple[str, Moments]]) -> list[LatentModel] | None:
-    """Estimate for each fold the latents of the classes in all others.
+    """Estimate for each part the latents of the classes in all others.
 
     `moments` has the object id and the moments of each sure asset, in an order that does not depend
-    on the number of jobs. None where the assets of all other folds have less than two classes.
+    on the number of jobs. None where the assets of all other parts have less than two classes.
     """
     sums: dict[int, Moments] = {}
     for object_id, some in moments:
-        fold = fold_of(object_id)
-        sums[fold] = sums[fold] + some if fold in sums else some
+        part = part_of(object_id)
+        sums[part] = sums[part] + some if part in sums else some
     models = []
-    for fold in range(FOLDS):
-        others = [sums[other] for other in sorted(sums) if other != fold]
+    for part in range(PARTS):
+        others = [sums[other] for other in sorted(sums) if other != part]
         seen = reduce(add, others) if others else None
         if seen is None or np.count_nonzero(seen.weight) < 2:
             return None

@@ -23,14 +23,15 @@ from slatprep.learn.predictions import (
     require_normalised,
 )
 from slatprep.learn.splits import select_assets
-from slatprep.learn.style import INK, MUTED
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField, find_grids, one_grid
 from slatprep.readers.pixieverse import read_prediction
 from slatprep.readers.splits import Split
 from slatprep.records import (
     BACKGROUND,
+    INK,
     MATERIAL_CLASSES,
+    MUTED,
     PROPERTY_COLUMNS,
     UNANNOTATED,
     MaterialField,

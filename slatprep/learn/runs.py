@@ -21,9 +21,9 @@ import torch
 
 from slatprep.errors import ConfigError
 from slatprep.learn.predictions import RUN_BYTES, RUN_FILE, SPLITS_FILE
-from slatprep.learn.style import INK, MUTED
 from slatprep.readers.files import refusing
 from slatprep.readers.splits import Assignment
+from slatprep.records import INK, MUTED
 from slatprep.storage.atomic import staged, take_lock
 from slatprep.storage.documents import read_document
 from slatprep.storage.place import storage_of

@@ -123,12 +123,15 @@ class TrainSummary:
         are no objects to validate on.
     predictions : Path
         Predictions of the test objects, for `slatprep evaluate`.
+    diverged_in : int, optional
+        The epoch whose loss is no finite number, with which training ended.
     """
 
     history: list[EpochRecord]
     best_epoch: int
     references: dict[str, float]
     predictions: Path
+    diverged_in: int | None = None
 
 
 def train(
@@ -169,17 +172,16 @@ def train(
             known = run.parameters.get("precision") or precision_of(device)
             parameters = replace(parameters, precision=known)
         run.begin(asdict(parameters) | {"store": str(opened.attributes["manifest"])}, assignment)
-        session = _Session(parameters, train_set, device, workers)
+        session = _Session(parameters, train_set, val_set, device, workers)
         state = run.load(LAST)
         if state is not None:
             with refusing(run.path / LAST, "cannot be read", "a checkpoint of this run"):
                 session.restore(state)
         while not session.finished and session.epoch != stop_after:
             train_loss, rate = session.run_epoch(steps, lambda: run.save(LAST, session.state()))
-            record = EpochRecord(session.epoch, rate, train_loss, *session.validate(val_set))
+            record = EpochRecord(session.epoch, rate, train_loss, *session.validate())
             session.history.append(record)
-            kept = session.history[session.best_epoch]
-            if not math.isfinite(kept.train_loss if val_set is None else kept.val_loss):
+            if session.diverged(session.best_epoch):
                 raise ConfigError(
                     f"{out}: the training diverged in epoch {record.epoch}: its loss is no finite "
                     "number; train with a smaller --learning-rate into another --out"
@@ -203,7 +205,8 @@ def train(
             run.draw(session.history, references)
         predictions = run.path / "predictions"
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
-    return TrainSummary(session.history, session.best_epoch, references, predictions)
+    diverged_in = session.epoch - 1 if session.diverged() else None
+    return TrainSummary(session.history, session.best_epoch, references, predictions, diverged_in)
 
 
 def precision_of(device: str) -> str:
@@ -244,11 +247,16 @@ class _Session:
     """The state of a training run: model, optimiser and history."""
 
     def __init__(
-        self, parameters: TrainParameters, dataset: SlatDataset, device: str, workers: int
+        self,
+        parameters: TrainParameters,
+        dataset: SlatDataset,
+        val_set: SlatDataset | None,
+        device: str,
+        workers: int,
     ) -> None:
         torch.manual_seed(parameters.seed)
         torch.use_deterministic_algorithms(device == "cpu")
-        self.parameters, self.device = parameters, device
+        self.parameters, self.val_set, self.device = parameters, val_set, device
         self.model = make_decoder(parameters.size, dataset.store.contents).to(device)
         self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=parameters.learning_rate)
         pinned = device != "cpu"
@@ -273,11 +281,18 @@ class _Session:
         losses = [record.val_loss for record in self.history]
         return int(np.argmin(np.nan_to_num(losses, nan=np.inf)))  # NaN where training diverged.
 
+    def diverged(self, epoch: int = -1) -> bool:
+        """Whether the loss of an epoch is no finite number, as is that of all after it."""
+        record = self.history[epoch]
+        return not math.isfinite(record.train_loss if self.val_set is None else record.val_loss)
+
     @property
     def finished(self) -> bool:
-        if self.epoch >= self.epochs:
-            return True
-        return bool(self.history) and self.epoch - 1 - self.best_epoch >= self.parameters.patience
+        if not self.history:
+            return False
+        without_better = self.epoch - 1 - self.best_epoch
+        at_end = self.epoch >= self.epochs or without_better >= self.parameters.patience
+        return at_end or self.diverged()
 
     def run_epoch(self, steps: Progress | None, save: Callable[[], None]) -> tuple[float, float]:
         """Train to the end of an epoch; return the mean loss and the last learning rate.
@@ -317,13 +332,13 @@ class _Session:
         return loss_of_epoch, rate
 
     @torch.no_grad()
-    def validate(self, dataset: SlatDataset | None) -> tuple[float, float, float]:
+    def validate(self) -> tuple[float, float, float]:
         """Return loss, MSE and class accuracy, means over assets; NaN where not defined."""
-        if dataset is None:
+        if self.val_set is None:
             return math.nan, math.nan, math.nan
         self.model.eval()
         scores = []
-        for batch in SlatLoader(dataset):
+        for batch in SlatLoader(self.val_set):
             moved = batch.to(self.device)
             prediction = self._predict(moved)
             valid = moved.valid
@@ -331,7 +346,7 @@ class _Session:
             right = (prediction.logits.argmax(1) == moved.material)[valid].float().mean()
             scores.append([float(loss_of(prediction, moved)), float(error), float(right)])
         loss, error, accuracy = np.mean(scores, axis=0).tolist()
-        return loss, error, accuracy if dataset.store.contents.classes else math.nan
+        return loss, error, accuracy if self.val_set.store.contents.classes else math.nan
 
     def state(self) -> dict[str, Any]:
         return {

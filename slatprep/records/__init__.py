@@ -20,6 +20,7 @@ from annotated_types import MaxLen, MinLen
 from numpy.typing import NDArray
 
 from slatprep.records.alignment import (
+    MIRRORED,
     Agreement,
     Alignment,
     Ambiguity,
@@ -62,6 +63,7 @@ from slatprep.records.tables import (
     COLOURS,
     FEATS_MEAN,
     FEATS_STD,
+    INK,
     MANY_BACKGROUND,
     MATERIAL_CLASSES,
     MATERIAL_COLOURS,
@@ -69,6 +71,7 @@ from slatprep.records.tables import (
     MAX_LATENT_RESOLUTION,
     MAX_NAME_BYTES,
     MAX_PROPERTIES,
+    MUTED,
     PIXIEVERSE,
     PROPERTIES,
     PROPERTY_COLUMNS,

@@ -23,6 +23,12 @@ from slatprep.records.tables import MAX_PROPERTIES, Engine, Model, Search, Verdi
 MAX_CANDIDATES = 4096
 """Candidates and placements of one alignment; engines try a few hundred starts."""
 
+MIRRORED = 0.025
+"""Rise of the score, once one side is mirrored, above which it is the other's mirror image.
+
+Of objects that are not mirrored, on real meshes of all levels, the largest was 0.015.
+"""
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -235,7 +241,8 @@ class FitFigures:
     score_slat, score_pixieverse : float
         Score over the samples of either side, under the final map.
     score_similarity : float
-        Mean of both sides' scores under the transform alone.
+        Score over the samples of both sides together under the transform alone; where another
+        engine placed it, the mean of both sides' scores.
     evidence_affine, evidence_deformable : float
         Rise of the score, in blocks of space that a trial fit had not seen, by
         an affine map, and by a coarse deformation after it; NaN if no trial
@@ -257,7 +264,7 @@ class FitFigures:
         Root mean square second derivative of the displacement over the
         lattice [1 / voxel]; 0 without one.
     mirrored : float
-        Rise of the score once one side is mirrored: above 0.025 the annotation is a
+        Rise of the score once one side is mirrored: above `MIRRORED` the annotation is a
         mirror image of its object. NaN where the fit is too good for that, or where
         another engine placed it.
     clear_by : float

@@ -79,6 +79,10 @@ UNANNOTATED_COLOUR = "#FFFFFF"
 """Colour of an occupied voxel without an annotation."""
 
 
+INK, MUTED = "#1F2328", "#6B7280"
+"""Colours of pictures: of text and data, and of what is only beside them."""
+
+
 def _colour_beyond(index: int) -> str:
     """Return a colour for a class beyond PhysGaussian's, unlike those before it."""
     # Steps of the golden ratio cover all hues and never repeat one.

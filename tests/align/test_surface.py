@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.shapes import GRID, chair, field_of, surface_latents
+from support.shapes import GRID, aligned, chair, field_of, surface_latents
 
 from slatprep.align.quality import compare, measure_quality
 from slatprep.align.starts import candidates_of, distinct_starts, euler_starts, so3_starts
@@ -11,7 +11,7 @@ from slatprep.align.surface import BAND, CENTRE, DILATION, surface_of
 from slatprep.geometry.frames import make_transform
 from slatprep.geometry.voxels import boundary, filled, voxels_of
 from slatprep.judge import THRESHOLDS, verdict_of
-from slatprep.records import Quality, Verdict
+from slatprep.records import Ambiguity, Judgement, Quality, Verdict
 
 
 def test_a_shell_and_its_solid_have_the_same_surface():
@@ -216,7 +216,9 @@ def test_voxels_inside_the_slat_do_not_count_against_it():
     ],
 )
 def test_verdicts_by_fitness_alone(fitness, backward, verdict, word):
-    given, reasons = verdict_of(Quality(fitness, 0.5, backward, 0.5, 0.9, 1.0), 1.0, 0.05, ties=1)
+    quality, twice = Quality(fitness, 0.5, backward, 0.5, 0.9, 1.0), [np.eye(4)] * 2
+    unknown = Judgement(Ambiguity(0.05, (0.0,)), Verdict.GOOD)
+    given, reasons = verdict_of(aligned(*twice, quality=quality), unknown, 1.0)
     assert given is verdict
     assert word in " ".join(reasons)
     assert bool(reasons) == (verdict is not Verdict.GOOD)

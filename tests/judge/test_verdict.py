@@ -13,7 +13,7 @@ from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import cube_symmetries, make_transform
 from slatprep.judge import THRESHOLDS, judge, measure_ambiguity, verdict_of
 from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, thinning
-from slatprep.judge.evidence import surroundings_of
+from slatprep.judge.evidence import FIGURES, surroundings_of
 from slatprep.judge.verdict import contradicted, merged
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.records import (
@@ -31,6 +31,25 @@ FINE = Quality(1.0, 0.5, 1.0, 0.5, 1.0, 1.0)
 ROUGH = Quality(0.7, 0.5, 0.6, 0.5, 0.7, 1.5)
 
 
+def said_of(
+    quality: Quality = FINE,
+    valid: float = 1.0,
+    ambiguity: float = 0.0,
+    ties: int = 0,
+    mirrored: float = math.nan,
+    worst: str = "",
+    **others: Any,
+) -> tuple[Verdict, tuple[str, ...]]:
+    """Return the verdict on an alignment with these figures; the one called `worst` is 0."""
+    figures = FitFigures(1.0, 1.0, 1.0, math.nan, math.nan, (1.0, 1.0, 1.0), 0.0, 0.0)
+    alignment = aligned(
+        *[np.eye(4)] * (ties + 1), quality=quality, figures=replace(figures, mirrored=mirrored)
+    )
+    evidence = tuple(0.0 if name == worst else math.nan for name in FIGURES) if worst else ()
+    known = Judgement(Ambiguity(ambiguity, (0.0,)), Verdict.GOOD, evidence=evidence, **others)
+    return verdict_of(alignment, known, valid)
+
+
 def judgement(verdict: Verdict, expected: float) -> Judgement:
     return Judgement(Ambiguity(0.0, (0.0,)), verdict, ("what it had",), 0.95, expected)
 
@@ -45,21 +64,32 @@ def annotation(likely: list[float] | None, unlabelled: int = 0) -> Annotation:
 def test_an_asset_on_every_limit_is_good_for_no_reason():
     least = THRESHOLDS
     shares = least.good_valid_share, least.good_ambiguity
-    given = verdict_of(FINE, *shares, 3, least.good_confidence, 1.0, least.good_accuracy)
+    sure = {"same_object": least.good_confidence, "right_placement": 1.0}
+    given = said_of(FINE, *shares, 3, **sure, expected_accuracy=least.good_accuracy)
     assert given == (Verdict.GOOD, ())
     # Where object and placement are sure, the fitness does not matter.
-    assert verdict_of(ROUGH, 1.0, same_object=0.96, right_placement=0.95) == (Verdict.GOOD, ())
+    assert said_of(ROUGH, same_object=0.96, right_placement=0.95) == (Verdict.GOOD, ())
 
 
 def test_a_tie_that_something_settled_is_as_good_as_its_probability():
-    settled = verdict_of(FINE, 1.0, 0.4, 0, same_object=0.99, right_placement=0.97)
+    settled = said_of(ambiguity=0.4, same_object=0.99, right_placement=0.97)
     assert settled == (Verdict.GOOD, ())
-    still_open, _ = verdict_of(FINE, 1.0, 0.4, 1, same_object=0.99, right_placement=0.97)
+    still_open, _ = said_of(ambiguity=0.4, ties=1, same_object=0.99, right_placement=0.97)
     assert still_open is Verdict.DOUBTFUL
 
 
 def test_every_reason_is_named_once():
-    verdict, reasons = verdict_of(ROUGH, 0.7, 0.4, 2, 0.6, 0.8, 0.7, "roughness", contradicted=True)
+    verdict, reasons = said_of(
+        ROUGH,
+        0.7,
+        0.4,
+        2,
+        worst="score_slat",
+        same_object=0.6,
+        right_placement=0.8,
+        expected_accuracy=0.7,
+        contradicted=True,
+    )
     assert verdict is Verdict.DOUBTFUL
     assert reasons == (
         "perhaps another object: the two sides show the same one with a probability of 60.0% "
@@ -80,21 +110,21 @@ def test_every_reason_is_named_once():
 
 @pytest.mark.parametrize(("gain", "good"), [(math.nan, True), (0.025, True), (0.026, False)])
 def test_a_mirrored_annotation_is_doubtful_however_sure_its_placement_is(gain, good):
-    verdict, reasons = verdict_of(FINE, 1.0, same_object=0.99, right_placement=1.0, mirrored=gain)
+    verdict, reasons = said_of(same_object=0.99, right_placement=1.0, mirrored=gain)
     assert verdict is (Verdict.GOOD if good else Verdict.DOUBTFUL)
     assert len(reasons) == (0 if good else 1)
     # Of another object it says nothing.
-    verdict, (reason,) = verdict_of(FINE, 1.0, 0, 0, 0.01, 1.0, mirrored=gain)
+    verdict, (reason,) = said_of(same_object=0.01, right_placement=1.0, mirrored=gain)
     assert verdict is Verdict.FAILED
     assert reason.startswith("probably another object")
 
 
 def test_without_a_cause_none_is_named_and_the_fitness_is():
-    _, (first, *fitnesses) = verdict_of(ROUGH, 1.0, same_object=0.6, right_placement=1.0)
+    _, (first, *fitnesses) = said_of(ROUGH, same_object=0.6, right_placement=1.0)
     assert first.endswith("together)")
     assert len(fitnesses) == 2
     # Of placements the fitness says nothing, as another one fits as well.
-    _, reasons = verdict_of(ROUGH, 1.0, same_object=1.0, right_placement=0.6, cause="shape")
+    _, reasons = said_of(ROUGH, worst="within_3", same_object=1.0, right_placement=0.6)
     assert len(reasons) == 1
     assert reasons[0].startswith("perhaps a wrong placement")
 
@@ -112,7 +142,7 @@ def test_without_a_cause_none_is_named_and_the_fitness_is():
     ],
 )
 def test_failed_says_which_of_the_two_questions_failed(same, placed, verdict, first):
-    given, reasons = verdict_of(FINE, 1.0, 0, 0, same, placed, cause="shape")
+    given, reasons = said_of(worst="within_3", same_object=same, right_placement=placed)
     assert given is verdict
     assert reasons[0].startswith(first)
     assert reasons[0].endswith("different shapes") == ("object" in first)
@@ -128,9 +158,10 @@ def test_failed_says_which_of_the_two_questions_failed(same, placed, verdict, fi
     ],
 )
 def test_a_placement_that_ties_is_not_failed(ties, ambiguity, verdict):
-    given, _ = verdict_of(FINE, 1.0, ambiguity, ties, same_object=1.0, right_placement=0.2)
+    given, _ = said_of(FINE, 1.0, ambiguity, ties, same_object=1.0, right_placement=0.2)
     assert given is verdict
-    assert verdict_of(FINE, 1.0, ambiguity, ties, 0.2, 1.0)[0] is Verdict.FAILED
+    other, _ = said_of(FINE, 1.0, ambiguity, ties, same_object=0.2, right_placement=1.0)
+    assert other is Verdict.FAILED
 
 
 @pytest.mark.parametrize("before", Verdict)

@@ -19,16 +19,16 @@ from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.judge.witness import (
     BLOCK,
     DECISIVE,
-    FOLDS,
     HARMLESS,
+    PARTS,
     REACH,
     LatentEvidence,
     LatentModel,
     Reliability,
     choice_of,
     fit_models,
-    fold_of,
     moments_of,
+    part_of,
     reliability_of,
     weigh,
 )
@@ -38,9 +38,9 @@ from slatprep.records import UNANNOTATED, MaterialField, StructuredLatents
 Array = NDArray[np.float64]
 
 
-def ids_of(fold: int, number: int) -> list[str]:
-    """Return so many ids of objects that belong to a fold."""
-    return [name for name in map(str, range(99)) if fold_of(name) == fold][:number]
+def ids_of(part: int, number: int) -> list[str]:
+    """Return so many ids of objects that belong to a part."""
+    return [name for name in map(str, range(99)) if part_of(name) == part][:number]
 
 
 def a_model(seed: int = 0) -> LatentModel:
@@ -68,7 +68,7 @@ def test_moments_of_an_asset_have_the_weight_of_one_asset():
 def test_a_model_has_the_moments_of_the_classes_about_their_means():
     """In two passes over weighted voxels. Some classes have less than one asset's weight in all."""
     rng = np.random.default_rng(1)
-    (fold, *others) = range(FOLDS)
+    (part, *others) = range(PARTS)
     samples, moments = [], []
     for name in (ids_of(other, 1)[0] for other in others):
         known = int(rng.integers(20, 60))
@@ -80,7 +80,7 @@ def test_a_model_has_the_moments_of_the_classes_about_their_means():
         samples.append((feats.astype(np.float64), material, np.full(known, 1.0 / known)))
         moments.append((name, moments_of(feats, material)))
     strange = moments_of(feats + 9, material)
-    models = fit_models([*moments, (ids_of(fold, 1)[0], strange)])
+    models = fit_models([*moments, (ids_of(part, 1)[0], strange)])
     assert models is not None
     z, material, weight = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     mean = np.average(z, axis=0, weights=weight)
@@ -94,13 +94,13 @@ def test_a_model_has_the_moments_of_the_classes_about_their_means():
     assert shares[2] * len(samples) < 1.0
     variance = np.average((z - mean) ** 2, axis=0, weights=weight)
     variance[7] = 1.0
-    np.testing.assert_allclose(models[fold].means, means, rtol=1e-9)
-    np.testing.assert_allclose(models[fold].shares, shares, atol=1e-12)
-    covariance = np.linalg.inv(models[fold].precision)
+    np.testing.assert_allclose(models[part].means, means, rtol=1e-9)
+    np.testing.assert_allclose(models[part].shares, shares, atol=1e-12)
+    covariance = np.linalg.inv(models[part].precision)
     np.testing.assert_allclose(covariance, within + 1e-3 * np.diag(variance), rtol=1e-6, atol=1e-9)
 
 
-def test_two_classes_in_two_folds_are_enough_for_models_and_less_is_not():
+def test_two_classes_in_two_parts_are_enough_for_models_and_less_is_not():
     rng = np.random.default_rng(2)
     feats = rng.normal(size=(40, 8)).astype(np.float32)
     two, one = np.repeat([1, 4], 20).astype(np.uint8), np.full(40, 4, dtype=np.uint8)
@@ -403,7 +403,7 @@ class Asset:
         self.latents = StructuredLatents(latents_of(coords).coords, feats)
 
     def evidence(self, models: list[LatentModel], *tied: np.ndarray) -> LatentEvidence:
-        model = models[fold_of(self.object_id)]
+        model = models[part_of(self.object_id)]
         return weigh(
             self.field, self.latents, aligned(*tied), self.material, model, SampleParameters()
         )

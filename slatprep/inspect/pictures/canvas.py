@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.records import INK as INK
+from slatprep.records import MUTED as MUTED
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -18,11 +21,9 @@ VERDICT_COLOURS = {"good": "#1B7F4B", "doubtful": "#B26A00", "failed": "#B3261E"
 """Colour of each verdict, which is always written out too."""
 
 ACCENT = "#2E9FF5"
-INK = "#1F2328"
-MUTED = "#6B7280"
 RULE = "#D5D9DE"
 PAPER = "#FFFFFF"
-"""Highlight, text, secondary text, lines and background."""
+"""Highlight, lines and background."""
 
 DISTANCE_COLOURS = ("#EEF1F4", "#F3BDB6", "#DD6472", "#931D52", "#2B0A3D")
 """Distances from 0 to the end of the scale, in even steps of lightness."""
@@ -139,10 +140,9 @@ def draw_legend(
     figure: Figure,
     entries: Sequence[tuple[str, str]],
     box: tuple[float, float, float],
-    rows: int = 2,
     **style: Any,
 ) -> None:
-    """Write names beside squares of their colours, from left to right, in at most so many rows.
+    """Write names beside squares of their colours, from left to right, in two rows at most.
 
     `entries` are names and colours. The number of entries beyond the room or `MOST_NAMES` follows
     the last one. `box` is left edge, first baseline and right edge in pixels; a row takes 20.
@@ -152,7 +152,7 @@ def draw_legend(
 
     width, height = size_of(figure)
     left, y, right = box
-    x, last = left, y + 20 * (rows - 1)
+    x, last = left, y + 20
     for number, (name, colour) in enumerate(entries):
         wide = 20 + 9.2 * len(name)
         if x > left and x + wide > right and y < last:
