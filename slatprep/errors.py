@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 
@@ -53,6 +54,16 @@ def amount(count: int, noun: str) -> str:
     ('1 voxel', '2,000 voxels', '0 assets')
     """
     return f"{count:,} {noun if count == 1 else noun + 's'}"
+
+
+def tally(words: Iterable[object]) -> str:
+    """Return how often each word occurs.
+
+    >>> tally(["good", "failed", "good"])
+    '1 failed, 2 good'
+    """
+    counts = sorted(Counter(map(str, words)).items())
+    return ", ".join(f"{count:,} {word}" for word, count in counts)
 
 
 def require_one_of(name: str, value: object, allowed: Iterable[str]) -> None:
@@ -115,6 +126,7 @@ def needing(what: str, extra: str, kind: type[SlatprepError] = ConfigError) -> I
     try:
         yield
     except ImportError as error:
-        package = f"the package {error.name}" if error.name else f"a package that fails ({error})"
+        missing = isinstance(error, ModuleNotFoundError)
+        package = f"the package {error.name}" if missing else f"a package that fails ({error})"
         way = f"install it with `pip install 'slatprep[{extra}]'`"
         raise kind(f"{what} {package}; {way}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -14,7 +13,7 @@ from slatprep.cli import options
 from slatprep.cli.info import show_errors, show_quality
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import Click, command
-from slatprep.errors import amount
+from slatprep.errors import amount, tally
 from slatprep.workers import Progress
 
 if TYPE_CHECKING:
@@ -387,9 +386,8 @@ def subset(
         opened = options.opened(store)
         wanted += [asset.asset_id for asset in list_assets(opened, *chosen.of(opened))]
         if not wanted:
-            there = sorted(Counter(map(str, opened.column("verdict"))).items())
-            counts = ", ".join(f"{count:,} {verdict}" for verdict, count in there)
-            raise click.UsageError(f"no asset of {store} is of that kind; there are {counts}")
+            there = tally(opened.column("verdict"))
+            raise click.UsageError(f"no asset of {store} is of that kind; there are {there}")
     with output.progress("subset", "shards") as progress:
         summary = subset_store(
             store, out, wanted, manifests=manifests, jobs=jobs, progress=progress

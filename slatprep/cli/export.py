@@ -120,14 +120,15 @@ def export(
         raise ConfigError("--split-by and --shares define splits; choose one with --split")
     if split != "all" and assets:
         raise ConfigError("--asset and --split both choose; give one of them")
+    opened = options.opened(store)
     if verdicts is None and not assets:
-        options.note_left_out(output, options.opened(store))
+        options.note_left_out(output, opened)
         verdicts = USABLE
     if split != "all":
-        assets = _of_split(output, options.opened(store), split, splits.rule)
+        assets = _of_split(output, opened, split, splits.rule)
     with output.progress("export") as progress:
         summary = export_store(
-            store,
+            opened,
             out,
             kind,
             assets=assets,
@@ -199,7 +200,7 @@ def publish(
     drawn = {"assets.png": _picture(opened, pictures)} if pictures and len(opened) else {}
     with output.progress("publish") as progress:
         summary = publish_store(
-            store,
+            opened,
             out,
             data,
             stated=Stated(**vars(stated)),

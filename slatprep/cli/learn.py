@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import click
 
 from slatprep.cli import options
-from slatprep.cli.latents import LatentsReader, Standardised
+from slatprep.cli.latents import Standardised
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError, InputError
@@ -282,6 +282,8 @@ def predict(
     require_torch(device or "cpu")
     import torch
 
+    from slatprep.latents import LatentsReader
+
     if device is None:
         # TRELLIS needs a GPU.
         device = "cuda" if is_image and torch.cuda.is_available() else "cpu"
@@ -300,7 +302,8 @@ def predict(
     space = decoder.contents.latents
     if image is not None:
         standardised = "no"  # TRELLIS samples them as its decoders take them.
-    read = LatentsReader(output, image.latents if image else source, assets, space, standardised)
+    place = image.latents if image else source
+    read = LatentsReader(place, assets, space, standardised, output.note, output.problem)
     counts = {"predicted": 0, "voxels": 0}
     seconds = {**(image.seconds if image else {}), "read": 0.0, "decode": 0.0, "write": 0.0}
     with output.progress("predict") as progress:

@@ -6,7 +6,6 @@ import dataclasses
 import difflib
 import math
 import pkgutil
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import click
 
 from slatprep.cli.output import Output, new_file
 from slatprep.cli.signature import Click, NewPath
-from slatprep.errors import StoreError
+from slatprep.errors import StoreError, tally
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -263,10 +262,8 @@ def note_left_out(output: Output, store: Store) -> None:
     """Print how many assets of a store are left out by the default verdicts."""
     from slatprep.records import USABLE
 
-    left = Counter(str(v) for v in store.column("verdict") if v not in USABLE)
-    if left:
-        counts = ", ".join(f"{count:,} {verdict}" for verdict, count in sorted(left.items()))
-        output.note(f"left out: {counts} (--verdict all takes them)")
+    if left := tally(one for one in store.column("verdict") if one not in USABLE):
+        output.note(f"left out: {left} (--verdict all takes them)")
 
 
 def _at_most_the_cores(_context: click.Context, _parameter: click.Parameter, jobs: int) -> int:

@@ -17,7 +17,6 @@ from slatprep.errors import require_one_of
 from slatprep.export import target
 from slatprep.export.formats import Exported, ExportOptions, Writer, choose_ids, describe_columns
 from slatprep.records import USABLE, Place
-from slatprep.storage.place import place_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_outside
 from slatprep.workers import Progress
@@ -58,7 +57,7 @@ class ExportSummary:
 
 
 def export_store(
-    store: str | Place,
+    store: Store | str | Place,
     out: str | Path,
     format: str,
     *,
@@ -72,8 +71,8 @@ def export_store(
 
     Parameters
     ----------
-    store : str or Place
-        The store.
+    store : Store, str or Place
+        An open store, or its path or URL.
     out : str or Path
         The file (``hdf5``) or folder (all others) to write. The new export replaces an old one
         when complete; other files stay.
@@ -106,8 +105,7 @@ def export_store(
     """
     begin = time.perf_counter()
     require_one_of("format", format, FORMATS)
-    options, store, out = options or ExportOptions(), place_of(store), Path(out)
-    opened = open_store(store)
+    options, opened, out = options or ExportOptions(), open_store(store), Path(out)
     require_outside(out)
     if verdicts is None:
         verdicts = () if assets else USABLE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError, require_one_of
+from slatprep.errors import ConfigError, StoreError, require_one_of, tally
 from slatprep.geometry.frames import voxel_centres
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, Verdict, words_of
 from slatprep.store import Store, StoredAsset
@@ -57,11 +56,9 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
     ids = (store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts)
     chosen = sorted(ids)
     if not chosen:
-        there = Counter(str(verdict[row]) for row in rows)
-        counts = ", ".join(f"{count} {name}" for name, count in sorted(there.items()))
         raise ConfigError(
             f"{store.path}: no asset has the verdict {' or '.join(verdicts)}; those asked for "
-            f"are {counts}"
+            f"are {tally(verdict[list(rows)])}"
         )
     return chosen
 

@@ -22,7 +22,7 @@ from slatprep.export import croissant, export_store, target
 from slatprep.export.croissant import Stated
 from slatprep.records import USABLE, Place, Verdict
 from slatprep.storage.files import file_digest, local_files
-from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
 from slatprep.store.integrity import file_findings
 from slatprep.store.reader import require_outside
@@ -46,7 +46,7 @@ class PublishSummary:
 
 
 def publish_store(
-    store: str | Place,
+    store: Store | str | Place,
     out: Path,
     data: Data = "store",
     *,
@@ -62,12 +62,11 @@ def publish_store(
     `progress` gets the number of assets done and of all. ConfigError if the store is not local, or
     `out` lies in one or holds other files. StoreError if a file differs from its digest.
     """
-    place, stated, out = place_of(store), stated or Stated(), Path(out)
-    local = storage_of(place).local
+    opened, stated, out = open_store(store), stated or Stated(), Path(out)
+    local = storage_of(opened.path).local
     if local is None:
-        raise ConfigError(f"{place} is on no local disk; copy it there to publish it")
+        raise ConfigError(f"{opened.path} is on no local disk; copy it there to publish it")
     require_outside(out)
-    opened = open_store(place)
     assets = len(opened)
     chosen: Sequence[str] = ()
     with target.directory(out) as folder:
@@ -82,7 +81,7 @@ def publish_store(
             where = f"{SHARDS}/*.tar"
             chosen = USABLE if verdicts is None else tuple(verdicts)
             assets = export_store(
-                place, folder / SHARDS, "webdataset", verdicts=chosen, progress=progress
+                opened, folder / SHARDS, "webdataset", verdicts=chosen, progress=progress
             ).assets
         for name, content in (pictures or {}).items():
             (folder / name).write_bytes(content)

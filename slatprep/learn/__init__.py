@@ -13,7 +13,7 @@
 
 import lazy_loader
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, needing
 
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
@@ -40,12 +40,8 @@ def require_torch(device: str = "cpu") -> None:
     ConfigError
         If PyTorch cannot be imported, with the command that installs it, or finds no ``cuda``.
     """
-    try:
+    with needing("decoders need", "train"):
         import torch
-    except ImportError as error:
-        raise ConfigError(
-            f"PyTorch cannot be imported ({error}); install it with `pip install 'slatprep[train]'`"
-        ) from error
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             f"PyTorch {torch.__version__} finds no CUDA device; expected an NVIDIA GPU and a build "

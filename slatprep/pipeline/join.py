@@ -27,7 +27,7 @@ from slatprep.records import Contents, LatentSpace, Normalization, Place, Proper
 from slatprep.storage.documents import adapter_of
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
-from slatprep.store import open_store
+from slatprep.store import Store, open_store
 from slatprep.store.records import build_in, manifests_beside
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most
@@ -41,7 +41,7 @@ _ROWS_A_JOB = 256
 
 
 def subset_store(
-    store: str | Place,
+    store: Store | str | Place,
     out: str | Place,
     assets: Iterable[str | int],
     *,
@@ -55,8 +55,8 @@ def subset_store(
 
     Parameters
     ----------
-    store : str or Place
-        The store to choose from; it stays as it is.
+    store : Store, str or Place
+        The store to choose from, open, or its path or URL; it stays as it is.
     out : str or Place
         The new store, a path or URL; an existing one is replaced in one step.
     assets : str, or iterable of str or int
@@ -91,7 +91,7 @@ def subset_store(
 
 
 def concat_stores(
-    stores: Iterable[str | Place],
+    stores: Iterable[Store | str | Place],
     out: str | Place,
     *,
     manifests: str | Place | None = None,
@@ -106,7 +106,7 @@ def concat_stores(
 
     Parameters
     ----------
-    stores : iterable of str or Place
+    stores : iterable of Store, str or Place
         Two or more; they stay as they are.
     out, manifests, jobs, progress
         As for `subset_store`.
@@ -142,8 +142,8 @@ def concat_stores(
     return _write(NextStore(_by_id(rows), tuple(sources), *how), parameters, place, jobs, progress)
 
 
-def _source(place: str | Place) -> SourceStore:
-    return SourceStore(open_store(open_store(place).path.absolute()))
+def _source(store: Store | str | Place) -> SourceStore:
+    return SourceStore(open_store(open_store(store).path.absolute()))
 
 
 def _rows(sources: Sequence[SourceStore]) -> list[Row]:

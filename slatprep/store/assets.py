@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import operator
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from html import escape
@@ -205,7 +205,7 @@ class AssetTable:
                 f"{asset_id!r} is no id; expected a text, or `match` where numbers are meant"
             )
         if asset_id not in self._index:
-            raise self._unknown(asset_id)
+            raise _unknown(asset_id, self._index, self.path, self._listing)
         return self._index[asset_id]
 
     def match(self, name: str | int) -> int:
@@ -219,42 +219,11 @@ class AssetTable:
         UnknownAssetError
             If there is none, or several begin so; the message names them.
         """
-        if not isinstance(name, str):
-            return self._numbered(operator.index(name))
-        if name in self._index:
-            return self._index[name]  # A loop over all assets must not search all ids each time.
-        alike = [known for known in self.ids if known.startswith(name)] if name else []
-        if len(alike) == 1:
-            return self._index[alike[0]]
-        views = all(known.startswith(f"{name}.") for known in alike)
-        if alike and not views:
-            raise UnknownAssetError(
-                f"{self.path}: {len(alike)} ids begin with {name!r}, such as "
-                f"{', '.join(alike[:3])}; give more of it"
-            )
-        if not alike and name.isascii() and name.isdigit():
-            return self._numbered(int(name))
-        raise self._unknown(name)
+        return match_id(name, self._index, self.path, self._listing)
 
-    def _numbered(self, number: int) -> int:
-        if not -len(self) <= number < len(self):
-            raise UnknownAssetError(
-                f"{self.path} has no asset {number}; it has {amount(len(self), 'asset')}, "
-                "numbered from 0"
-            )
-        return number % len(self)
-
-    def _unknown(self, name: str) -> UnknownAssetError:
-        """Return the error that offers ids which `name` might mean."""
-        alike = name.casefold()
-        begun = [known for known in self.ids if alike and known.casefold().startswith(alike)]
-        close = begun or difflib.get_close_matches(name, self.ids)
-        hint = (
-            f"did you mean {' or '.join(close[:5])}?"
-            if close
-            else f"it has {amount(len(self), 'asset')}; `slatprep list {self.path}` shows their ids"
-        )
-        return UnknownAssetError(f"{self.path} has no asset {name!r}; {hint}")
+    @property
+    def _listing(self) -> str:
+        return f"; `slatprep list {self.path}` shows their ids"
 
     def table(self) -> dict[str, NDArray[Any]]:
         """Return what is known of every asset, as columns of A values.
@@ -386,3 +355,45 @@ class AssetTable:
     @cached_property
     def _bytes(self) -> int:
         return sum(max(size, 0) for size in storage_of(self.path).files().values())
+
+
+def match_id(name: str | int, rows: Mapping[str, int], where: object, listing: str = "") -> int:
+    """Return the row that a name means, as `AssetTable.match` does; `rows` are by id.
+
+    UnknownAssetError tells `where` the ids are, and `listing`, what shows them.
+    """
+    if not isinstance(name, str):
+        return _numbered(operator.index(name), rows, where)
+    if name in rows:
+        return rows[name]  # A loop over all assets must not search all ids each time.
+    alike = [known for known in rows if known.startswith(name)] if name else []
+    if len(alike) == 1:
+        return rows[alike[0]]
+    views = all(known.startswith(f"{name}.") for known in alike)
+    if alike and not views:
+        raise UnknownAssetError(
+            f"{where}: {len(alike)} ids begin with {name!r}, such as "
+            f"{', '.join(alike[:3])}; give more of it"
+        )
+    if not alike and name.isascii() and name.isdigit():
+        return _numbered(int(name), rows, where)
+    raise _unknown(name, rows, where, listing)
+
+
+def _numbered(number: int, rows: Mapping[str, int], where: object) -> int:
+    if not -len(rows) <= number < len(rows):
+        raise UnknownAssetError(
+            f"{where} has no asset {number}; it has {amount(len(rows), 'asset')}, numbered from 0"
+        )
+    return number % len(rows)
+
+
+def _unknown(name: str, rows: Mapping[str, int], where: object, listing: str) -> UnknownAssetError:
+    """Return the error that offers ids which `name` might mean."""
+    alike = name.casefold()
+    begun = [known for known in rows if alike and known.casefold().startswith(alike)]
+    close = begun or difflib.get_close_matches(name, rows)
+    hint = f"it has {amount(len(rows), 'asset')}{listing}"
+    if close:
+        hint = f"did you mean {' or '.join(close[:5])}?"
+    return UnknownAssetError(f"{where} has no asset {name!r}; {hint}")

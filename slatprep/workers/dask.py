@@ -23,17 +23,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
-from slatprep.errors import ConfigError, SlatprepError, amount
+from slatprep.errors import SlatprepError, amount, needing
 from slatprep.records import Place
 from slatprep.storage.place import place_of, storage_of
 from slatprep.workers.local import Pool, run_in_pools, single_threaded
 
-try:
+with needing("a cluster needs", "cluster"):
     import distributed
-except ImportError as error:
-    raise ConfigError(
-        f"Dask cannot be imported ({error}); install it with `pip install 'slatprep[cluster]'`"
-    ) from error
 
 Result = TypeVar("Result")
 

@@ -18,6 +18,7 @@ from slatprep.export import ExportOptions, export_store
 from slatprep.export.ply import VERTEX
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import MATERIAL_CLASSES
+from slatprep.store import open_store
 
 ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"  # latent_model of TRELLIS's configurations
 
@@ -65,7 +66,7 @@ def test_an_npz_export_is_what_trellis_loads(model, store, mixed, tmp_path):
 
 
 def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
-    export_store(store, tmp_path / "root", "npz")
+    export_store(open_store(store), tmp_path / "root", "npz")
     for asset_id, asset in mixed.assets.items():
         with np.load(tmp_path / "root" / "latents" / ENCODER / f"{asset_id}.npz") as data:
             assert sorted(data) == ["coords", "feats", "material", "properties", "valid"]

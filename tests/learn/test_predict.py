@@ -124,6 +124,8 @@ def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint, tmp_path):
         first = held["properties"]
     run(slats, "--checkpoint", checkpoint, "--out", out, "--asset", "a")
     assert np.array_equal(np.load(out / "a.npz")["properties"], first)
+    words = ("predict", slats, "--checkpoint", checkpoint, "--out", out, "--asset", "b.fron_t")
+    assert f"{slats} has no asset 'b.fron_t'; did you mean b.front?" in refused(*words)
     carried = predicted_field(out / "a.npz", None)
     assert np.array_equal(carried.voxels, random_latents(1).coords)
 

@@ -33,7 +33,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_subset_is_the_build_of_its_assets(folder, tmp_path):
-    summary = subset_store(folder / "abcd.zarr", tmp_path / "s.zarr", ["d", "b.s", "b.front"])
+    whole = open_store(folder / "abcd.zarr")
+    summary = subset_store(whole, tmp_path / "s.zarr", ["d", "b.s", "b.front"])
     assert summary.statuses == {"ok": 3, "failed": 0, "skipped": 0}
     assert tree(tmp_path / "s.zarr") == tree(folder / "bd.zarr")
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
@@ -62,7 +63,7 @@ def test_a_text_is_one_asset_and_nothing_is_no_place(folder, tmp_path):
 
 
 def test_joined_stores_are_the_build_of_all_their_assets(folder, tmp_path):
-    concat_stores([folder / "bd.zarr", folder / "ac.zarr"], tmp_path / "all.zarr")
+    concat_stores([open_store(folder / "bd.zarr"), folder / "ac.zarr"], tmp_path / "all.zarr")
     assert tree(tmp_path / "all.zarr") == tree(folder / "abcd.zarr")
     assert verify_store(tmp_path / "all.zarr").ok
 
