@@ -9,11 +9,8 @@ import pytest
 from support.commands import run
 from support.trees import records_of, tree
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep import ConfigError, StoreError, build_store, load_parameters, open_store
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters.files import load_parameters
-from slatprep.pipeline.dataset import build_store
-from slatprep.store import open_store
 from slatprep.store.record import MAX_WARNINGS
 from slatprep.store.records import StoredRecords
 

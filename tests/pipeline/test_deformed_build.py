@@ -11,6 +11,7 @@ import zarr
 from scipy.spatial import cKDTree
 from support.deformed import MOVES
 
+from slatprep import Store, open_store
 from slatprep.export import ExportOptions, export_store
 from slatprep.geometry.frames import VOXEL_SIZE, voxel_centres
 from slatprep.inspect.check import check_alignment
@@ -18,8 +19,6 @@ from slatprep.inspect.verify import verify_store
 from slatprep.particles.fields import stored_field
 from slatprep.particles.transfer import transfer
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.store import open_store
-from slatprep.store.reader import Store
 from slatprep.store.record_json import FOLDER, read_asset_record, to_json
 from slatprep.store.records import StoredRecords
 

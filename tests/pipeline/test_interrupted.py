@@ -14,12 +14,10 @@ from support.rights import BOUND_BY_PERMISSIONS
 from support.synthetic import Dataset, Made
 from support.trees import tree
 
-from slatprep.errors import StoreError
+from slatprep import StoreError, build_store, open_store
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.work import work_beside
 from slatprep.storage import atomic
-from slatprep.store import open_store
 
 
 @pytest.fixture

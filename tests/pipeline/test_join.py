@@ -12,11 +12,8 @@ from support.made_store import edit_attributes
 from support.synthetic import Dataset
 from support.trees import records_of, tree
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep import ConfigError, StoreError, build_store, concat_stores, open_store, subset_store
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import build_store
-from slatprep.pipeline.join import concat_stores, subset_store
-from slatprep.store import open_store
 
 
 @pytest.fixture(scope="module")

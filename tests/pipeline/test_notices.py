@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from support.synthetic import Dataset, MakeDataset
 
-from slatprep.errors import ConfigError
+from slatprep import ConfigError, build_store
 from slatprep.normalize import ranges_from_extents
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.notices import nothing_usable, wild_ranges
 from slatprep.pipeline.publish import BuildSummary, counts_of, summarise
 from slatprep.pipeline.recipe import recipe_of, record_of_failed

@@ -9,15 +9,13 @@ import pytest
 import zarr
 from support.trees import inodes, records_beside, tree
 
-from slatprep.demo import make_demo
+from slatprep import load_parameters, make_demo, open_store
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.score import score_against_truth
 from slatprep.inspect.verify import verify_store
 from slatprep.judge import THRESHOLDS
 from slatprep.parameters import BuildParameters, ConsensusParameters, WitnessParameters
-from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.store import open_store
 
 SETTLED = ConsensusParameters(settle=True)
 HEARD = WitnessParameters(settle=True)

@@ -11,13 +11,10 @@ from support.published import IDS, add, pack, parameters, write_object
 from support.synthetic import make_asset
 from support.trees import records_of, tree
 
-from slatprep.errors import InputError
+from slatprep import InputError, build_store, discover, open_store, read_field
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import build_store
-from slatprep.readers import discover, read_field
 from slatprep.storage import archives
 from slatprep.storage.files import LocalFile
-from slatprep.store import open_store
 
 
 @pytest.fixture(autouse=True)

@@ -10,12 +10,9 @@ from support.published import IDS, pack, parameters
 from support.published_hub import PublishedHub
 from support.trees import tree
 
-from slatprep.errors import ConfigError, InputError
+from slatprep import ConfigError, InputError, build_store, discover, open_store
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import build_store
-from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
-from slatprep.store import open_store
 
 NAME = "vlongle/pixieverse"
 URL = f"hf://datasets/{NAME}"

@@ -9,10 +9,8 @@ import pytest
 from support.synthetic import Dataset
 from support.trees import tree
 
-from slatprep import ConfigError, InputError
+from slatprep import ConfigError, InputError, build_store, open_store
 from slatprep.parameters import BuildParameters, NormalizeParameters
-from slatprep.pipeline.dataset import build_store
-from slatprep.store import open_store
 from slatprep.store.record_json import read_build_record
 
 

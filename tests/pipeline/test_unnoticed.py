@@ -14,9 +14,8 @@ from support.installed import package
 from support.synthetic import Dataset, make_asset
 from support.trees import tree
 
-from slatprep import readers
+from slatprep import build_store, readers
 from slatprep.pipeline import before, plan, seen
-from slatprep.pipeline.dataset import build_store
 from slatprep.records import AssetPair, SourceRoots
 from slatprep.storage import states
 

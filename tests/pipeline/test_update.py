@@ -14,11 +14,10 @@ from support.first_builds import tree_from_nothing
 from support.synthetic import make_asset
 from support.trees import inodes, tree
 
-from slatprep.errors import StoreError
+from slatprep import StoreError, open_store
 from slatprep.parameters import AlignParameters, BuildParameters
 from slatprep.pipeline import recipe
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.store import open_store
 
 
 def reasons(parameters: BuildParameters, out: Path) -> dict[str, tuple[str, str]]:

@@ -10,9 +10,7 @@ import pytest
 from support.synthetic import Made
 from support.trees import tree
 
-from slatprep.errors import ConfigError, StoreError
-from slatprep.pipeline.dataset import build_store
-from slatprep.pipeline.join import subset_store
+from slatprep import ConfigError, StoreError, build_store, subset_store
 from slatprep.pipeline.work import work_beside
 from slatprep.storage import atomic
 from slatprep.storage.atomic import staged, take_lock, writing

@@ -21,11 +21,9 @@ from google_crc32c import value as crc32c
 from support.commands import refused, run
 from support.made_store import edit_json, placed
 
-from slatprep.errors import StoreError
+from slatprep import Store, StoreError, build_store, open_store
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, StoreParameters
-from slatprep.pipeline.dataset import build_store
-from slatprep.store import Store, open_store
 from slatprep.store.contract import gate_findings
 from slatprep.store.layout import ARRAYS
 

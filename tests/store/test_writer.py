@@ -12,9 +12,8 @@ import pytest
 import zarr
 from support.trees import tree
 
-from slatprep.errors import StoreError
+from slatprep import Normalization, PropertyRange, StoreError
 from slatprep.parameters import StoreParameters
-from slatprep.records import Normalization, PropertyRange
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import read_metadata
 from slatprep.store.integrity import write_digests

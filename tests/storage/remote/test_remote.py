@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from support.commands import refused
 
-from slatprep.errors import ConfigError
+from slatprep import ConfigError, open_store
 from slatprep.readers.files import load_source
 from slatprep.records import Place
 from slatprep.storage.cache import VARIABLE, cache_folder, cached_file, folder_for
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.ranges import range_reader
 from slatprep.storage.remote import RemoteFile, RemotePlace
-from slatprep.store import open_store
 
 
 @pytest.mark.parametrize(

@@ -13,13 +13,11 @@ from support.faults import inject, kill_self
 from support.remote import Dataset, built, current, put, raising, versions
 from support.trees import contents, tree
 
-from slatprep.errors import StoreError
+from slatprep import StoreError, build_store, open_store
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import build_store
 from slatprep.storage.place import place_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import read_pointer
-from slatprep.store import open_store
 
 Fault = Callable[[str, str], object]
 

@@ -7,12 +7,9 @@ import h5py
 import pytest
 from support.faults import inject
 
-from slatprep.errors import ConfigError
+from slatprep import ConfigError, discover, load_parameters, open_store
 from slatprep.parameters import SlatSource
-from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.readers import discover
-from slatprep.store import open_store
 
 
 def test_each_place_is_listed_once_and_each_file_fetched_once(uploaded, tmp_path, requests):

@@ -20,16 +20,14 @@ from support.faulty_proxy import Faults, faulty
 from support.remote import current, put, raising, versions
 from support.trees import contents, tree
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep import ConfigError, Store, StoreError, open_store, subset_store
 from slatprep.inspect.overview import overview_of
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline.dataset import build_store, plan_build
-from slatprep.pipeline.join import subset_store
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer
-from slatprep.store import Store, open_store
 
 
 def test_a_store_is_built_from_s3_to_s3_and_equals_the_local_one(
