@@ -34,22 +34,15 @@ def test_names_that_are_not_utf_8_cost_their_assets_alone(make_dataset, tmp_path
 
 
 # Half a pair of surrogates, and what lies beyond Unicode.
-BOUNDS = {
-    "half": np.array(["\ud800"]),
-    "beyond": np.array([0x7FFFFFFF], np.uint32).view("<U1"),
-}
+NO_TEXT = {"half": np.array(["\ud800"]), "beyond": np.array([2**31 - 1], np.uint32).view("<U1")}
 
 
 def test_what_is_no_text_is_written_out_or_left_out(make_dataset, tmp_path):
-    dataset, categories = make_dataset(*BOUNDS), tmp_path / "categories.json"
+    dataset, categories = make_dataset(*NO_TEXT), tmp_path / "categories.json"
     categories.write_text('{"half": {"obj_class": "x\\ud800y"}}')
-    for name, model in BOUNDS.items():
-        np.savez(
-            dataset.root / "pixieverse" / name / "clip_features.npz",
-            model=model,
-            min_bounds=np.full(3, -0.5, np.longdouble),
-            max_bounds=np.full(3, 0.5, ">f8"),
-        )
+    bounds = {"min_bounds": np.full(3, -0.5, np.longdouble), "max_bounds": np.full(3, 0.5, ">f8")}
+    for name, model in NO_TEXT.items():
+        np.savez(dataset.root / f"pixieverse/{name}/clip_features.npz", model=model, **bounds)
     parameters = dataset.parameters(pairing={"categories": categories})
     summary = build_store(parameters, tmp_path / "s.zarr")
     store = open_store(summary.store)
@@ -84,8 +77,7 @@ def test_bad_names_of_annotations_are_left_out_and_too_many_refused(make_dataset
     dataset = make_dataset("a", "b", "c")
     grids = dataset.root / "pixieverse"
     for name in ("a", "b"):
-        samples = [BAD] if name == "b" else range(1, 256)
-        for sample in samples:
+        for sample in [BAD] if name == "b" else range(1, 256):
             (grids / name / f"sample_{sample}").mkdir()
             grid = f"sample_{sample}/material_grid.npy"
             os.link(grids / name / "sample_0/material_grid.npy", grids / name / grid)

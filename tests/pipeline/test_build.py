@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 from support.faults import inject
-from support.synthetic import JELLY, METAL, Dataset, MakeDataset, make_asset
+from support.synthetic import METAL, Dataset, MakeDataset, make_asset
 from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
@@ -77,9 +77,7 @@ def stop(*reached: object) -> None:
 
 
 @pytest.mark.parametrize("step", ["work folder made", "work folder locked"])
-def test_a_build_that_is_stopped_as_it_begins_leaves_nothing(
-    make_dataset, tmp_path, monkeypatch, step
-):
+def test_a_build_stopped_as_it_begins_leaves_nothing(make_dataset, tmp_path, monkeypatch, step):
     dataset = make_dataset("a")
     before = sorted(tmp_path.iterdir())
     inject(monkeypatch, lambda reached, name: reached == step and stop())
@@ -150,29 +148,6 @@ def test_ranges_by_name_clip_and_count(make_dataset, tmp_path):
     assert summary.clipped == clipped
     assert store.column("clipped").tolist() == [[in_voxels, in_voxels, 0]]
     assert store.column("clipped_grid").tolist() == [[in_grid, in_grid, 0]]
-
-
-def test_ranges_from_a_file(make_dataset, tmp_path):
-    ranges = tmp_path / "ranges.toml"
-    ranges.write_text(
-        "[youngs_modulus]\nlo = 3.0\nhi = 13.0\n[density]\nlo = 1.0\nhi = 5.0\n"
-        "[poissons_ratio]\nlo = 0.0\nhi = 0.5\n"
-    )
-    dataset = make_dataset("a")
-    summary = build_store(dataset.parameters(str(ranges)), tmp_path / "s.zarr")
-    asset = open_store(summary.store).asset("a")
-    jelly = asset.properties[asset.material == JELLY[0]]
-    # log10: (5 - 3) / 10 -> -0.6; (3 - 1) / 4 -> 0; 0.3 / 0.5 -> 0.2.
-    assert np.allclose(jelly, [-0.6, 0.0, 0.2], atol=1e-6)
-    assert sum(summary.clipped.values()) == 0
-    assert open_store(summary.store).normalization.source == "ranges.toml"
-
-
-def test_ranges_that_cannot_be_read_are_told_before_any_work(make_dataset, tmp_path, steps):
-    parameters = make_dataset("a").parameters(str(tmp_path / "none.toml"))
-    with pytest.raises(ConfigError, match=r"none\.toml: cannot read ranges"):
-        build_store(parameters, tmp_path / "s.zarr")
-    assert steps == []
 
 
 def test_names_without_anything_in_common_are_told_in_one_line(make_dataset, tmp_path):
@@ -260,7 +235,7 @@ def test_manifests_go_where_asked(make_dataset, tmp_path):
     assert not manifests_of(tmp_path / "s.zarr").exists()
 
 
-def test_alignment_alone_counts_every_asset_and_gives_the_stores_transforms(
+def test_alignment_alone_counts_assets_and_gives_the_stores_transforms(
     mixed, mixed_build, tmp_path
 ):
     out, seen = tmp_path / "out" / "mixed.jsonl", list[tuple[int, int]]()

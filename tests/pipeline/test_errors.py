@@ -30,18 +30,14 @@ def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def test_decoys_are_of_other_objects_and_are_aligned_once(store):
-    aligned: list[tuple[int, int]] = []
-
-    def progress(done: int, most: int) -> None:
-        aligned.append((done, most))
-
-    first = measure_errors(store, decoys=3, seed=1, progress=progress)
+    aligned: list[tuple[int, ...]] = []
+    first = measure_errors(store, decoys=3, seed=1, progress=lambda *at: aligned.append(at))
     objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
     assert len(first.decoys) == 3
     assert aligned == [(1, 3), (2, 3), (3, 3)]
     assert all(objects[one.grid] != objects[one.slat] for one in first.decoys)
     text = (manifests_of(store.path) / ERRORS).read_bytes()
-    measure_errors(store, decoys=3, seed=1, progress=progress)
+    measure_errors(store, decoys=3, seed=1, progress=lambda *at: aligned.append(at))
     assert len(aligned) == 3, "they were taken over"
     assert (manifests_of(store.path) / ERRORS).read_bytes() == text
     assert told_of(store) == first.sentences()

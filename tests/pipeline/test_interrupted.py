@@ -47,17 +47,10 @@ def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
     assert len((manifests / "assets.jsonl").read_text().splitlines()) == 3
 
 
-@pytest.mark.parametrize(
-    ("step", "calls"),
-    [
-        ("asset begun", 2),
-        ("shard begun", 3),
-        ("directory flushed", 0),
-        ("directory exchanged", 0),
-        ("store replaced", 0),
-        ("manifests written", 0),
-    ],
-)
+@pytest.mark.parametrize(("step", "calls"), [
+    ("asset begun", 2), ("shard begun", 3), ("directory flushed", 0), ("directory exchanged", 0),
+    ("store replaced", 0), ("manifests written", 0),
+])  # fmt: skip
 def test_killed_at_every_step(reference, old_store, tmp_path, step, calls):
     dataset, expected = reference
     out = tmp_path / "s.zarr"

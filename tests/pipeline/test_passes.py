@@ -222,9 +222,7 @@ def test_it_is_undone_by_building_without_it_and_the_same_for_any_jobs(telling, 
     assert tree(store) == tree(stores[0])
 
 
-def test_with_a_consensus_before_it_the_record_goes_back_to_the_first_pass(
-    telling, stores, tmp_path
-):
+def test_after_a_consensus_the_record_goes_back_to_the_first_pass(telling, stores, tmp_path):
     both = replace(telling[1], witness=HEARD, consensus=SETTLED)
     store = copied(stores[0], tmp_path / "store.zarr")
     build_store(both, store)

@@ -115,21 +115,21 @@ def test_a_single_value_gets_a_width(make_dataset, tmp_path):
     np.testing.assert_allclose(ranges_of(out), [[5.5, 6.5], [2.5, 3.5], [-0.25, 0.75]])
 
 
-@pytest.mark.parametrize(
-    ("text", "error", "message"),
-    [
-        ('{"train": ["a"]', InputError, "cannot be read"),
-        ('{"train": ["nobody"]}', InputError, "none of the dataset's"),
-        ('{"test": ["a"], "val": ["b"]}', ConfigError, "no object is trained on"),
-    ],
-)
-def test_lists_that_cannot_be_used_are_named(make_dataset, tmp_path, steps, text, error, message):
-    dataset, out = make_dataset("a", "b"), tmp_path / "s.zarr"
-    (tmp_path / "lists.json").write_text(text)
-    chosen = of(dataset, ranges="p1-p99", objects="train", split_by=str(tmp_path / "lists.json"))
-    with pytest.raises(error, match=message):
-        build_store(chosen, out)
-    assert not steps and not out.exists()
+def test_lists_and_ranges_that_cannot_be_used_are_told_before_any_work(
+    make_dataset, tmp_path, steps
+):
+    dataset, lists = make_dataset("a", "b"), tmp_path / "lists.json"
+    chosen = of(dataset, ranges="p1-p99", objects="train", split_by=str(lists))
+    for text, parameters, error, told in (
+        ('{"train": ["a"]', chosen, InputError, "cannot be read"),
+        ('{"train": ["nobody"]}', chosen, InputError, "none of the dataset's"),
+        ('{"test": ["a"], "val": ["b"]}', chosen, ConfigError, "no object is trained on"),
+        ("", of(dataset, ranges=f"{tmp_path}/none.toml"), ConfigError, "cannot read ranges"),
+    ):
+        lists.write_text(text)
+        with pytest.raises(error, match=told):
+            build_store(parameters, tmp_path / "s.zarr")
+    assert not steps and not (tmp_path / "s.zarr").exists()
 
 
 def test_a_range_that_cuts_off_most_values_is_told(make_dataset, tmp_path):
@@ -140,6 +140,7 @@ def test_a_range_that_cuts_off_most_values_is_told(make_dataset, tmp_path):
     )
     summary = build_store(of(dataset, ranges=str(file)), tmp_path / "s.zarr")
     (told,) = [one for one in summary.warnings if "beyond its range" in one]
+    assert open_store(summary.store).normalization.source == "si.toml"
     assert told == (
         "100% of the values of youngs_modulus are beyond its range, in log10 of the SI value, "
         "1e+04 to 1e+06, and were set to the end of it: see normalize.ranges"

@@ -38,19 +38,8 @@ def asked(dataset: Dataset, samples: Samples = "merge", ranges: str = "dataset")
     second = PixieverseSource(dataset.root / "second", adapter="voxels")
     also = (second, PixieverseSource(dataset.root / "third"))
     parameters = dataset.parameters(ranges, pixieverse={"samples": samples})
-    return (
-        replace(parameters, also=also)
-        if second.root.exists() and samples == "merge"
-        else parameters
-    )
-
-
-def write_sample(
-    dataset: Dataset, object_id: str, sample: int, grid: np.ndarray, source: str = "pixieverse"
-) -> None:
-    path = dataset.root / source / object_id / f"sample_{sample}" / "material_grid.npy"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, grid)
+    merges = second.root.exists() and samples == "merge"
+    return replace(parameters, also=also) if merges else parameters
 
 
 def sample_grid(seed: int, factor: float, metal: int = 1) -> np.ndarray:
@@ -83,11 +72,11 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """
     dataset = Dataset(tmp_path_factory.mktemp("several")).having(*"abc")
     for sample, factor in enumerate(FACTORS):
-        write_sample(dataset, "a", sample, sample_grid(0, factor, metal=2 if sample == 2 else 1))
+        dataset.write_grid("a", sample_grid(0, factor, metal=2 if sample == 2 else 1), sample)
     (dataset.root / "second").mkdir()
     describe(dataset.root)
     write_second(dataset.root, "b", 1)
-    write_sample(dataset, "b", 0, sample_grid(1, STIFFER, metal=2), "third")
+    dataset.write_grid("b", sample_grid(1, STIFFER, metal=2), source="third")
     return dataset
 
 
@@ -220,13 +209,13 @@ def test_labels_are_made_again_of_sources_that_moved(own, tmp_path):
     subset_store(out, tmp_path / "b.zarr", ["b"])
     assert verify_store(tmp_path / "b.zarr", sources=True).findings == ()
     now = own.root.rename(tmp_path / "now")
-    also = [
+    second, third = (
         SourceRoots(now / name, now / "slat", number=k)
         for k, name in enumerate(("second", "third"), 1)
-    ]
-    roots = SourceRoots(now / "pixieverse", now / "slat", also=tuple(also))
+    )
+    roots = SourceRoots(now / "pixieverse", now / "slat", also=(second, third))
     assert verify_store(out, sources=True, roots=roots).findings == ()
-    fewer = replace(roots, also=(also[0],))
+    fewer = replace(roots, also=(second,))
     (finding,) = verify_store(out, sources=True, roots=fewer).findings
     assert "[[also]] 2, whose root is not known" in finding.what
 
@@ -243,11 +232,9 @@ def test_each_sample_may_be_an_asset(several, tmp_path):
     store = open_store(str(build_store(asked(several, "all"), tmp_path / "all.zarr").store))
     assert store.ids == ["a.sample_0", "a.sample_1", "a.sample_2", "b", "c"]
     assert set(store.column("object_id")) == {"a", "b", "c"}
-    moduli = [
-        store.asset(f"a.sample_{k}").properties_si[:, 0].astype(float) for k in range(len(FACTORS))
-    ]
+    first, *_ = moduli = [store.asset(f"a.sample_{k}").properties_si[:, 0] for k in range(3)]
     for factor, modulus in zip(FACTORS, moduli, strict=True):
-        np.testing.assert_allclose(modulus, moduli[0] * factor, rtol=1e-4)
+        np.testing.assert_allclose(modulus, first * factor, rtol=1e-4)
     assert not store.merges
 
 
@@ -272,7 +259,7 @@ def test_what_fails_is_left_out_and_named_and_an_asset_fails_when_none_is_left(o
     assert {str(a.action) for a in plan_build(asked(own), out).assets} == {"reuse"}
 
     for sample in range(len(FACTORS)):
-        write_sample(own, "a", sample, np.zeros((64, 64, 63, 4), np.float32))
+        own.write_grid("a", np.zeros((64, 64, 63, 4), np.float32), sample)
     (own.root / "third/b/sample_0/material_grid.npy").write_bytes(b"torn")
     summary = build_store(asked(own), out)
     assert summary.statuses == {"ok": 1, "failed": 2, "skipped": 0}
@@ -307,7 +294,7 @@ def test_a_change_in_any_annotation_redoes_that_object_alone(own, merged, tmp_pa
     for name in "cb":
         assert {one.action for one in plan_build(asked(own), out).assets} == {"reuse"}
         if name == "c":
-            write_sample(own, "c", 1, sample_grid(2, 2.0))
+            own.write_grid("c", sample_grid(2, 2.0), 1)
         else:
             write_second(own.root, "b", 1, factor=2.0)
         aligned.clear()
@@ -318,15 +305,12 @@ def test_a_change_in_any_annotation_redoes_that_object_alone(own, merged, tmp_pa
 
 
 @pytest.mark.parametrize(("sample", "ok"), [(0, 3), (1, 2)])
-def test_a_grid_replaced_during_the_build_never_gets_the_key_of_other_labels(
-    own, tmp_path, monkeypatch, sample, ok
-):
+def test_a_grid_replaced_meanwhile_gets_no_key_of_others(own, tmp_path, monkeypatch, sample, ok):
     """Sample 0 has been read when it is replaced, sample 1 has been hashed alone."""
-    new = sample_grid(0, 20.0)
 
     def replace_grid(step: str, name: str) -> None:
         if (step, name) == ("asset aligned", "a"):
-            write_sample(own, "a", sample, new)
+            own.write_grid("a", sample_grid(0, 20.0), sample)
 
     with monkeypatch.context() as during:
         inject(during, replace_grid)
@@ -339,9 +323,7 @@ def test_a_grid_replaced_during_the_build_never_gets_the_key_of_other_labels(
     assert tree(again.store) == tree(fresh.store)
 
 
-def test_a_store_gains_and_loses_its_spread_and_any_number_of_jobs_writes_the_same(
-    several, merged, plain, tmp_path
-):
+def test_a_store_gains_and_loses_its_spread_whatever_the_jobs(several, merged, plain, tmp_path):
     out = tmp_path / "s.zarr"
     for samples, expected in (("first", plain), ("merge", merged), ("first", plain)):
         build_store(asked(several, samples), out, jobs=2 if samples == "merge" else 1)
@@ -442,16 +424,10 @@ def test_tables_that_disagree_are_refused(own, tmp_path, changes, words):
 
 def test_a_dataset_definition_names_further_sources(own):
     path = own.root / "dataset.toml"
-    text = """
-        [pixieverse]
-        root = "pixieverse"
-        samples = "merge"
-        [slat]
-        root = "slat"
-        [[also]]
-        root = "second"
-        adapter = "voxels"
-    """
+    text = (
+        '[pixieverse]\nroot = "pixieverse"\nsamples = "merge"\n[slat]\nroot = "slat"\n'
+        '[[also]]\nroot = "second"\nadapter = "voxels"\n'
+    )
     path.write_text(text)
     parameters = load_parameters(path)
     assert parameters.also == (PixieverseSource(own.root / "second", adapter="voxels"),)

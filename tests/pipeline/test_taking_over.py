@@ -7,6 +7,7 @@ import random
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from string import ascii_lowercase
 
 import numpy as np
 import pytest
@@ -104,9 +105,7 @@ def test_new_assets_come_behind_and_the_rest_stays_where_it_is(built, steps):
             np.testing.assert_array_equal(values, getattr(asset, name))
 
 
-def test_shards_that_a_larger_store_has_larger_are_made_of_chunks_as_they_are(
-    make_dataset, monkeypatch, steps, tmp_path
-):
+def test_larger_shards_are_made_of_chunks_as_they_are(make_dataset, monkeypatch, steps, tmp_path):
     monkeypatch.setattr(layout, "MOST_SHARDS", 4)
     monkeypatch.setattr(layout, "_CHUNKS_IN_SHARD", (1, 4096))
     dataset, out = make_dataset("a", "c"), tmp_path / "s.zarr"
@@ -128,14 +127,9 @@ def stiffer(dataset: Dataset) -> None:
     dataset.write_slat("h.npz", made.coords, made.feats)
 
 
-def other_latents(dataset: Dataset) -> None:
-    made = make_asset(1)
-    dataset.write_slat("c.npz", made.coords, made.feats + 1)
-
-
 UPDATES = {
     "new and last": (lambda dataset: dataset.add("h", 1), {"h": "not in the store"}, "", 9),
-    "other latents": (other_latents, {"c": "sources changed: slat"}, "", 4),
+    "other latents": (lambda data: data.change_slat("c"), {"c": "sources changed: slat"}, "", 4),
     "removed": (lambda dataset: dataset.remove("e"), {"e": "no longer among the sources"}, "", 4),
     "other ranges": (stiffer, {"h": "not in the store"}, "aceg", 0),
 }
@@ -213,7 +207,7 @@ def test_any_sequence_of_updates_comes_to_the_same_when_compacted(make_dataset, 
             what = rng.choice(["add", "add", "change", "remove"])
             name = rng.choice(there)
             if what == "add":
-                name = rng.choice([one for one in "abcdefghijklmnopqrstuvwxyz" if one not in there])
+                name = rng.choice(sorted({*ascii_lowercase} - {*there}))
                 there.append(name)
             if what == "remove" and len(there) > 1:
                 there.remove(name)
@@ -324,7 +318,7 @@ def test_what_was_seen_is_not_trusted_without_reason(built, steps, monkeypatch, 
 def test_what_was_seen_of_one_store_is_nothing_to_another(built, tmp_path, steps):
     dataset, out = built
     shutil.copytree(out, tmp_path / "kept")
-    dataset.write_slat("c.npz", make_asset(1).coords, make_asset(1).feats + 1)
+    dataset.change_slat("c")
     build_store(dataset.parameters(), out)
     shutil.rmtree(out)
     (tmp_path / "kept").rename(out)

@@ -11,7 +11,7 @@ import pytest
 from support.faults import inject
 from support.first_builds import tree_from_nothing
 from support.installed import package
-from support.synthetic import Dataset, make_asset
+from support.synthetic import Dataset
 from support.trees import tree
 
 from slatprep import build_store, readers
@@ -25,11 +25,6 @@ WAIT_S = 2 * states.FINE_NS / 1e9
 def built(dataset: Dataset, folder: Path, **how: object) -> dict[str, str]:
     summary = build_store(dataset.parameters(), folder / "s.zarr", **how)  # type: ignore[arg-type]
     return tree(summary.store)
-
-
-def other_slat(dataset: Dataset, name: str = "a.npz") -> None:
-    made = make_asset(0)
-    dataset.write_slat(name, made.coords, made.feats + 1)
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -53,14 +48,12 @@ def test_a_mapping_that_is_held_open(tmp_path, closed):
 @pytest.mark.parametrize("what", ["folder", "root that is a link", "file of an update"])
 def test_sources_that_are_exchanged_while_they_are_read_and_put_back(tmp_path, monkeypatch, what):
     dataset, other = (Dataset(tmp_path / name).having("a") for name in ("d", "other"))
-    other_slat(other)
+    other.change_slat("a")
     place, theirs = dataset.root / "slat", other.root / "slat"
     if what == "file of an update":
         place, theirs = place / "a.npz", theirs / "a.npz"
         built(dataset, tmp_path, rehash=0)
-        with np.load(place) as arrays:
-            changed = arrays["coords"], arrays["feats"] + 2
-        dataset.write_slat("a.npz", *changed)
+        dataset.change_slat("a", 2)
     elif what == "root that is a link":
         dataset.root.rename(tmp_path / "v1")
         place, theirs = dataset.root, tmp_path / "v2"
@@ -102,7 +95,7 @@ def unnoticed(
         for path in dataset.root.rglob("*.np*"):
             looked[str(path)] = of(states.States(), str(path))
         monkeypatch.setattr(states.States, "of", same)
-        other_slat(dataset, "a3.npz")
+        dataset.change_slat("a3")
         return dataset
 
     built(dataset, tmp_path)
@@ -125,9 +118,7 @@ def test_a_share_is_hashed_at_each_build_and_finds_all(unnoticed, tmp_path):
     assert tree(tmp_path / "s.zarr") == tree_from_nothing(dataset.parameters())
 
 
-def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
-    tmp_path, monkeypatch, files_are_old
-):
+def test_at_least_one_is_hashed_by_default_or_none_if_asked(tmp_path, monkeypatch, files_are_old):
     dataset, hashed = Dataset(tmp_path / "d").having("a", "b"), list[str]()
     built(dataset, tmp_path)
     real = plan.hash_sources
@@ -141,9 +132,7 @@ def test_at_least_one_is_hashed_by_default_and_none_if_so_asked(
     assert len(hashed) == 3
 
 
-def test_an_adapter_of_another_version_is_no_change_of_the_sources(
-    tmp_path, monkeypatch, files_are_old
-):
+def test_another_version_of_an_adapter_changes_no_source(tmp_path, monkeypatch, files_are_old):
     dataset, out = Dataset(tmp_path / "d").having("a", "b"), tmp_path / "s.zarr"
     code = {"mine": "from slatprep.readers.pixieverse import PixieVerse"}
     points = "[slatprep.sources]\nmine = mine:PixieVerse\n"

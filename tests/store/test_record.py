@@ -17,12 +17,7 @@ from slatprep.pipeline.dataset import BuildSummary
 from slatprep.records import PIXIEVERSE, LatentSpace, Property
 from slatprep.storage.documents import adapter_of
 from slatprep.store import open_store
-from slatprep.store.attributes import (
-    RootAttributes,
-    read_attributes,
-    segments_of,
-    width_findings,
-)
+from slatprep.store.attributes import RootAttributes, read_attributes, segments_of, width_findings
 from slatprep.store.record import AssetRecord, FailedRecord
 from slatprep.store.record_json import (
     FOLDER,
@@ -79,37 +74,17 @@ def test_what_is_written_is_read_again_bit_for_bit(mixed_build):
     assert to_json(build, indent=True) + b"\n" == file.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("status", "fine"),
-        ("status", "failed"),
-        ("status", GONE),
-        ("format_version", 2),
-        ("asset_id", ""),
-        ("alignment", GONE),
-        ("alignment/engine", "magic"),
-        ("alignment/transform/3", GONE),
-        ("alignment/transform/0/0", "1"),
-        ("alignment/quality/fitness", 1.5),
-        ("alignment/quality/fitness", -0.1),
-        ("alignment/quality/surplus", 1),
-        ("alignment/candidates/0/index", -1),
-        ("alignment/candidates/0/index", 0.5),
-        ("judgement/verdict", "splendid"),
-        ("sources", []),
-        ("sources/0/role", "photo"),
-        ("sources/0/sha256", "beef"),
-        ("parameters/align/radius", "1"),
-        ("parameters/sample/surplus", 1),
-        ("counts/valid", -1),
-        ("versions", GONE),
-        ("versions/numpy", GONE),
-        ("code", "0" * 63),
-        ("key", ""),
-        ("surplus", 1),
-    ],
-)
+@pytest.mark.parametrize(("path", "value"), [
+    ("status", "fine"), ("status", "failed"), ("status", GONE), ("format_version", 2),
+    ("asset_id", ""), ("alignment", GONE), ("alignment/engine", "magic"),
+    ("alignment/transform/3", GONE), ("alignment/transform/0/0", "1"),
+    ("alignment/quality/fitness", 1.5), ("alignment/quality/fitness", -0.1),
+    ("alignment/quality/surplus", 1), ("alignment/candidates/0/index", -1),
+    ("alignment/candidates/0/index", 0.5), ("judgement/verdict", "splendid"), ("sources", []),
+    ("sources/0/role", "photo"), ("sources/0/sha256", "beef"), ("parameters/align/radius", "1"),
+    ("parameters/sample/surplus", 1), ("counts/valid", -1), ("versions", GONE),
+    ("versions/numpy", GONE), ("code", "0" * 63), ("key", ""), ("surplus", 1),
+])  # fmt: skip
 def test_what_is_no_record_is_refused_and_named(record, path, value):
     document = json.loads(to_json(record))
     changed = placed(document, path, value)
@@ -250,6 +225,9 @@ SAME = "property_columns and normalization must name the same properties"
         ("property_columns", ["density", "hue", "hue"], " is {", SAME),
         ("property_columns", ["density", "taste"], " is {", SAME),
         ("property_units", ["1"], " is {", "property_units must have a unit for each of"),
+        ("latents/mean", [0.0], "latents is {", "a mean and a std above 0 for each of 8"),
+        ("latents/channels", 0, "latents/channels is 0", ""),
+        ("property_columns/0", "E [Pa]", "property_columns/0 is 'E [Pa]'", ""),
         ("manifest", LONG, f"manifest is '{LONG[:99]}", ""),
         ("manifest", GONE, "manifest is missing", ""),
         ("build/versions", GONE, "build/versions is missing", ""),

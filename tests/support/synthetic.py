@@ -100,9 +100,11 @@ class Dataset:
             shutil.rmtree(self.root / "pixieverse" / object_id, ignore_errors=True)
             (self.root / "slat" / f"{object_id}.npz").unlink(missing_ok=True)
 
-    def write_grid(self, object_id: str, grid: np.ndarray) -> None:
+    def write_grid(
+        self, object_id: str, grid: np.ndarray, sample: int = 0, source: str = "pixieverse"
+    ) -> None:
         """Write a grid as PixieVerse lays it out."""
-        path = self.root / "pixieverse" / object_id / "sample_0" / "material_grid.npy"
+        path = self.root / source / object_id / f"sample_{sample}" / "material_grid.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, grid)
 
@@ -111,6 +113,11 @@ class Dataset:
         path = self.root / "slat" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(path, coords=coords, feats=feats)
+
+    def change_slat(self, object_id: str, by: float = 1.0) -> None:
+        """Write other latents of an object."""
+        asset = self.assets[object_id]
+        self.write_slat(f"{object_id}.npz", asset.coords, asset.feats + np.float32(by))
 
     def parameters(self, ranges: str = "dataset", **groups: dict[str, object]) -> BuildParameters:
         """Return the parameters of a build with many small shards, and with others of groups."""

@@ -14,13 +14,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import run
-from support.dask_processes import (
-    Processes,
-    end,
-    threads_for_workers,
-    wait_for_workers,
-    wait_until,
-)
+from support.dask_processes import Processes, end, threads_for_workers, wait_for_workers, wait_until
 from support.faults import flip
 from support.synthetic import Dataset, Made
 from support.trees import tree
@@ -98,9 +92,7 @@ def test_a_build_whose_workers_are_killed_gives_the_same_bytes(shared, address, 
     assert verify_store(tmp_path / "s.zarr").ok
 
 
-def test_an_asset_that_kills_every_worker_is_named_and_the_others_go_in(
-    shared, address, local, tmp_path
-):
+def test_an_asset_that_kills_every_worker_costs_itself_alone(shared, address, local, tmp_path):
     dataset, expected = local
     deadly = shared[0].folder / "deadly-b"
     deadly.touch()

@@ -107,9 +107,7 @@ def spooled(s3: Any, url: str) -> list[str]:
     return [name for name in s3.find(f"{url}/spool") if name.endswith(".arrays")]
 
 
-def test_a_worker_that_does_not_reach_the_store_is_named_before_any_work(
-    url, uploaded, shared, address, tmp_path_factory
-):
+def test_a_worker_without_the_store_is_named(url, uploaded, shared, address, tmp_path_factory):
     lost = shared[0].worker_elsewhere(
         address, tmp_path_factory.getbasetemp(), AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY=""
     )
@@ -132,9 +130,7 @@ def test_what_others_keep_beside_a_spool_is_refused_and_stays(s3, url, undisturb
 ASSET = f"ab/ab{'0' * 30}.arrays"
 
 
-def test_a_build_elsewhere_keeps_its_finished_assets_until_it_has_ended(
-    s3, url, tmp_path, monkeypatch
-):
+def test_a_build_elsewhere_keeps_its_finished_assets_to_its_end(s3, url, tmp_path, monkeypatch):
     place = place_of(url)
     with work_beside(place, private_disks=True) as running:
         running.shared()
@@ -165,9 +161,7 @@ def test_a_build_that_failed_leaves_finished_assets_but_no_mark(s3, url):
     assert contents(s3, url).keys() == {f"spool/{ASSET}"}
 
 
-def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
-    s3, url, change_client, tmp_path
-):
+def test_a_spool_that_cannot_be_emptied_fails_no_build(s3, url, change_client, tmp_path):
     refused = [PermissionError(13, "Access Denied")]
     change_client("_lsdir", raising(refused[0], S3FileSystem._lsdir, lambda *_: bool(refused)))
     with (
@@ -184,9 +178,7 @@ def test_a_spool_that_cannot_be_emptied_does_not_fail_a_build_that_succeeded(
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
 
 
-def test_a_dry_run_on_a_cluster_finds_what_its_build_would(
-    s3, url, undisturbed, uploaded, shared, address
-):
+def test_a_dry_run_on_a_cluster_finds_the_same(s3, url, undisturbed, uploaded, shared, address):
     kill = shared[0].folder / "kill at asset spooled"
     kill.touch()
     with Cluster(address) as cluster:

@@ -63,9 +63,7 @@ def build_and_be_killed(fault: Callable[[], Fault], dataset: Dataset, url: str) 
     [(kill_midway, False), (kill_after, True)],
     ids=["while it uploads", "after the pointer"],
 )
-def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(
-    s3, url, undisturbed, another, fault, shown, requests
-):
+def test_a_killed_build_leaves_a_whole_store(s3, url, undisturbed, another, fault, shown, requests):
     (_, old), (dataset, new) = undisturbed, another
     put(old, url)
     build_and_be_killed(fault, dataset, url)
@@ -82,9 +80,7 @@ def test_a_build_that_is_killed_leaves_a_whole_store_and_the_next_one_completes(
     assert versions(s3, url) == {pointer.version, pointer.previous}  # type: ignore[union-attr]
 
 
-def test_what_a_killed_build_uploaded_goes_when_the_sources_changed_since(
-    s3, url, undisturbed, another
-):
+def test_what_a_killed_build_uploaded_goes_when_sources_changed(s3, url, undisturbed, another):
     (_, expected), (dataset, _) = undisturbed, another
     build_and_be_killed(kill_midway, dataset, url)
     assert 0 < len(contents(s3, url)) < 30
@@ -96,9 +92,7 @@ def test_what_a_killed_build_uploaded_goes_when_the_sources_changed_since(
     assert len(versions(s3, url)) == 1
 
 
-def test_a_build_is_refused_that_another_has_overtaken(
-    s3, url, undisturbed, another, monkeypatch, tmp_path
-):
+def test_an_overtaken_build_is_refused(s3, url, undisturbed, another, monkeypatch, tmp_path):
     """The other runs on another machine: no lock of this one's disk keeps it out."""
     elsewhere = str(tmp_path / "elsewhere")
 
@@ -149,9 +143,7 @@ def test_the_server_itself_refuses_a_pointer_that_moved_at_the_last_moment(
 
 
 @pytest.mark.parametrize("mute", [False, True], ids=["one answer", "every answer"])
-def test_a_lost_answer_makes_no_failure_of_a_success_and_no_word_false(
-    s3, url, undisturbed, another, change_client, mute
-):
+def test_a_lost_answer_makes_no_success_fail(s3, url, undisturbed, another, change_client, mute):
     put(another[1], url)
     made = upload_store(undisturbed[1], published_state(place_of(url)))
     pipe, cat, lost = S3FileSystem._pipe_file, S3FileSystem._cat_file, []
@@ -196,7 +188,7 @@ def below(names: list[str], version: str) -> set[str]:
 
 
 @pytest.mark.usefixtures("files_are_old", "few_are_new")
-def test_shards_that_did_not_change_are_copied_by_the_server_and_what_is_gone_is_made_again(
+def test_the_server_copies_shards_and_what_is_gone_is_made(
     s3, url, tmp_path, requests, monkeypatch
 ):
     dataset, beside = built(tmp_path, "a", "c", "e", "g")

@@ -57,9 +57,7 @@ def test_a_root_that_is_not_there_is_named(uploaded, bucket, place, tmp_path):
         )
 
 
-def test_objects_that_are_torn_or_gone_are_named_and_the_others_go_in(
-    uploaded, s3, bucket, tmp_path, monkeypatch
-):
+def test_torn_and_lost_objects_cost_their_assets_alone(uploaded, s3, bucket, tmp_path, monkeypatch):
     torn = s3.cat_file(f"{bucket}/data/slat/b.npz")[:1000]
     s3.pipe_file(f"{bucket}/data/slat/b.npz", torn)
     grid = f"s3://{bucket}/data/pixieverse/c/sample_0/material_grid.npy"
@@ -71,9 +69,7 @@ def test_objects_that_are_torn_or_gone_are_named_and_the_others_go_in(
     assert problems["c"].startswith(f"{grid}: does not exist")
 
 
-def test_one_hdf5_file_of_many_assets_is_copied_once(
-    uploaded, undisturbed, s3, bucket, tmp_path, requests
-):
+def test_one_hdf5_file_of_all_is_copied_once(uploaded, undisturbed, s3, bucket, tmp_path, requests):
     dataset, expected = undisturbed
     with h5py.File(tmp_path / "all.h5", "w") as file:
         for asset_id, asset in dataset.assets.items():
