@@ -1,4 +1,5 @@
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreE
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import align_pairs, build_store
 from slatprep.store import open_store
-from slatprep.store.records import build_in, manifests_beside, manifests_of
+from slatprep.store.records import build_in, manifests_beside
 
 
 def test_bad_assets_are_told_and_the_others_go_in(mixed_build):
@@ -20,8 +21,7 @@ def test_bad_assets_are_told_and_the_others_go_in(mixed_build):
     problems = dict(mixed_build.problems)
     assert set(problems) == {"lone", "torn"}
     assert "no SLAT for id 'lone'" in problems["lone"]
-    assert "torn.npz" in problems["torn"]
-    assert "expected" in problems["torn"]
+    assert "torn.npz" in problems["torn"] and "expected" in problems["torn"]
     assert all("\n" not in reason for reason in problems.values())
     lines = [json.loads(line) for line in mixed_build.records.read_text().splitlines()]
     assert [line["asset_id"] for line in lines] == open_store(mixed_build.store).ids
@@ -71,16 +71,11 @@ def test_no_usable_asset_is_an_error_and_keeps_the_old_store(make_dataset, tmp_p
     assert len(open_store(out)) == 1
 
 
-def stop(*reached: object) -> None:
-    """Stand at a seam, or where progress is told, and press Ctrl-C."""
-    raise KeyboardInterrupt
-
-
 @pytest.mark.parametrize("step", ["work folder made", "work folder locked"])
 def test_a_build_stopped_as_it_begins_leaves_nothing(make_dataset, tmp_path, monkeypatch, step):
     dataset = make_dataset("a")
     before = sorted(tmp_path.iterdir())
-    inject(monkeypatch, lambda reached, name: reached == step and stop())
+    inject(monkeypatch, lambda at, name: at == step and signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         build_store(dataset.parameters(), tmp_path / "s.zarr")
     assert sorted(tmp_path.iterdir()) == before
@@ -203,8 +198,7 @@ def test_no_asset_is_lost_to_a_few_odd_voxels(odd, tmp_path):
         assert np.isnan(asset.grid_properties[:, 30, 25:28, 28]).all()
         assert (asset.material < 7).all()
         counts = records[name]["counts"]
-        assert counts["unphysical"] == (3 if name == "a" else 0)
-        assert counts["unannotated"] == 3
+        assert counts["unphysical"] == (3 if name == "a" else 0) and counts["unannotated"] == 3
         of_grid = (odd.assets[name].grid[..., 3] != 7).sum()
         assert counts["occupied"] == counts["annotated"] + 3 == of_grid
     assert store.column("unphysical").tolist() == [3, 0, 0]
@@ -216,8 +210,7 @@ def test_no_asset_is_lost_to_a_few_odd_voxels(odd, tmp_path):
 
     far = store.asset("c")
     assert far.valid.tolist() == [False, False] + [True] * len(odd.assets["c"].coords)
-    assert far.material[:2].tolist() == [255, 255]
-    assert np.isnan(far.properties[:2]).all()
+    assert far.material[:2].tolist() == [255, 255] and np.isnan(far.properties[:2]).all()
     assert (far.distance[:2] > 3.0).all()
     assert summary.n_valid == summary.n_voxels - 2
     assert verify_store(out, sources=True).ok
@@ -225,14 +218,6 @@ def test_no_asset_is_lost_to_a_few_odd_voxels(odd, tmp_path):
     assert build_store(odd.parameters(), out).n_unphysical == 3
     strict = odd.parameters(sample={"max_unphysical": 0.0})
     assert [asset_id for asset_id, _ in build_store(strict, out).problems] == ["a"]
-
-
-def test_manifests_go_where_asked(make_dataset, tmp_path):
-    parameters = make_dataset("a").parameters()
-    build_store(parameters, tmp_path / "s.zarr", manifests=tmp_path / "elsewhere" / "records")
-    names = {path.name for path in (tmp_path / "elsewhere" / "records").iterdir()}
-    assert names == {"assets.jsonl", "build.json", "sources.seen"}
-    assert not manifests_of(tmp_path / "s.zarr").exists()
 
 
 def test_alignment_alone_counts_assets_and_gives_the_stores_transforms(

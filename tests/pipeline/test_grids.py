@@ -8,14 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 from support.commands import run
 
-from slatprep import (
-    build_store,
-    compare_stores,
-    concat_stores,
-    export_store,
-    open_store,
-    subset_store,
-)
+from slatprep import build_store, compare_stores, concat_stores, export_store, open_store
 from slatprep.demo import make_demo
 from slatprep.demo.latents import Encoder
 from slatprep.errors import ConfigError
@@ -29,6 +22,7 @@ from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import WitnessParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.particles.fields import predicted_field, stored_field
+from slatprep.pipeline.join import subset_store
 from slatprep.readers.splits import Shares
 from slatprep.records import BACKGROUND
 from slatprep.store.records import StoredRecords
@@ -64,8 +58,7 @@ def test_sides_are_placed_and_labels_are_right(demo):
     # A face of a shell may lie anywhere in its voxels: by half of one a placement may be off.
     allowed = 0.5 * 64 / side_of(demo)
     for score in scores:
-        assert score.valid_share > 0.99
-        assert score.label_accuracy > 0.97
+        assert score.valid_share > 0.99 and score.label_accuracy > 0.97
         assert score.symmetric or score.displacement < allowed
 
 

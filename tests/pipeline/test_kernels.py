@@ -111,7 +111,5 @@ def test_few_assets_start_no_process(make_dataset, tmp_path, monkeypatch):
         raise AssertionError(f"{number} processes for two assets")
 
     monkeypatch.setattr(local, "_Processes", refuse)
-    summary = build_store(
-        make_dataset("a", "b").parameters(), tmp_path / "s.zarr", jobs=4, assets_per_job=20
-    )
-    assert summary.complete
+    parameters = make_dataset("a", "b").parameters()
+    assert build_store(parameters, tmp_path / "s.zarr", jobs=4, assets_per_job=20).complete

@@ -18,11 +18,8 @@ from slatprep.readers.adapters import SOURCES
 from slatprep.store.record import AssetRecord, StageParameters
 from slatprep.store.record_json import read_asset_record
 
-RECIPE = Recipe(
-    StageParameters(AlignParameters(), SampleParameters()),
-    {"numpy": "2.0", "scipy": "1.11"},
-    "c0de",
-)
+STAGES = StageParameters(AlignParameters(), SampleParameters())
+RECIPE = Recipe(STAGES, {"numpy": "2.0", "scipy": "1.11"}, "c0de")
 DIGESTS = {"grid": "0" * 64, "slat": "1" * 64}
 
 
@@ -33,16 +30,14 @@ def record(mixed_build: BuildSummary) -> AssetRecord:
 
 
 def test_all_that_touches_the_numbers_is_in_the_key_and_no_order():
+    nearer = replace(STAGES, sample=SampleParameters(max_distance=1.0))
     others = (
         RECIPE.key("b", DIGESTS),
         RECIPE.key("a", {**DIGESTS, "slat": "2" * 64}),
         RECIPE.key("a", {"grid": DIGESTS["slat"], "slat": DIGESTS["grid"]}),
         replace(RECIPE, versions={"numpy": "2.1", "scipy": "1.11"}).key("a", DIGESTS),
         replace(RECIPE, code="c0de2").key("a", DIGESTS),
-        replace(
-            RECIPE,
-            parameters=StageParameters(AlignParameters(), SampleParameters(max_distance=1.0)),
-        ).key("a", DIGESTS),
+        replace(RECIPE, parameters=nearer).key("a", DIGESTS),
     )
     key = RECIPE.key("a", DIGESTS)
     assert len({key, *others}) == 1 + len(others)
@@ -67,17 +62,13 @@ def test_what_changed_is_said(record):
     assert unknown.difference(record, ()) == "libraries changed: small_gicp was None, is 1.0"
 
 
-def fingerprint_of(monkeypatch: pytest.MonkeyPatch, path: Path) -> str:
-    monkeypatch.setattr(fingerprint, "numeric_modules", lambda: {"m": path})
-    return code_fingerprint.__wrapped__()
-
-
 def test_statements_count_and_words_do_not(tmp_path, monkeypatch):
     module = tmp_path / "m.py"
+    monkeypatch.setattr(fingerprint, "numeric_modules", lambda: {"m": module})
 
     def of(text: str) -> str:
         module.write_text(text)
-        return fingerprint_of(monkeypatch, module)
+        return str(code_fingerprint.__wrapped__())
 
     first = of('"""Words."""\n\n\ndef f(x):\n    """More."""\n    return x + 1  # why\n')
     assert of("def f(x):\n    return (x +\n            1)\n") == first
@@ -126,14 +117,8 @@ def test_it_covers_every_module_that_an_asset_runs_through_and_is_the_same_elsew
     assert key == code_fingerprint()
     loaded = set(modules.split())
     # Packages that only gather names, words of errors, and values that the key holds.
-    uncounted = {
-        "slatprep",
-        "slatprep.geometry",
-        "slatprep.readers",
-        "slatprep.storage",
-        "slatprep.errors",
-        "slatprep.parameters",
-    }
+    rooms = ("geometry", "readers", "storage", "errors", "parameters")
+    uncounted = {"slatprep", *(f"slatprep.{name}" for name in rooms)}
     # These find files, and read none.
     finding = {f"slatprep.readers.{name}" for name in ("pairing", "joins", "slat_files")}
     # Whichever way bytes come, their digests tell them.

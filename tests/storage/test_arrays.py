@@ -34,8 +34,7 @@ def test_arrays_come_back_as_they_were(tmp_path):
         read = ArrayFile(file)
         assert list(read) == list(ARRAYS)
         for name in reversed(ARRAYS):
-            assert read[name].dtype == ARRAYS[name].dtype
-            assert read[name].flags.writeable
+            assert read[name].dtype == ARRAYS[name].dtype and read[name].flags.writeable
             np.testing.assert_array_equal(read[name], ARRAYS[name])
         with pytest.raises(KeyError):
             read["another"]
@@ -115,9 +114,8 @@ def index(files: list[tuple[str, int]]) -> tuple[list[str], SparseArchive]:
 def test_all_that_is_needed_is_found(count, frame, spread, seed):
     files = objects(count, frame, spread, random.Random(seed))
     names, archive = index(files)
-    assert [n for n in names if ARCHIVE.is_wanted(n)] == [
-        n for n, _ in files if ARCHIVE.is_wanted(n)
-    ]
+    wanted = [name for name, _ in files if ARCHIVE.is_wanted(name)]
+    assert [name for name in names if ARCHIVE.is_wanted(name)] == wanted
     assert archive.bytes < 0.015 * archive.size + 2**23
     if frame < 250_000:
         assert archive.requests < 12 * 25

@@ -199,22 +199,12 @@ def test_a_full_disk_before_anything_is_written_is_told(tmp_path, monkeypatch):
     assert "cannot write there (No space left" in refused(tmp_path / "s.zarr")
 
 
-@pytest.mark.parametrize("file", ["build.json", "assets.jsonl"])
-def test_a_folder_for_records_that_holds_others_is_refused(undisturbed, tmp_path, file):
-    (tmp_path / "records").mkdir()
-    (tmp_path / "records" / file).write_text('{"mine": 1}\n')
-    with pytest.raises(StoreError, match=f"records: holds a {file} that is not slatprep's"):
-        build_store(
-            undisturbed[0].parameters(), tmp_path / "s.zarr", manifests=tmp_path / "records"
-        )
-    assert (tmp_path / "records" / file).read_text() == '{"mine": 1}\n'
-
-
 def test_what_others_have_beside_a_store_is_refused_before_any_work(undisturbed, tmp_path):
     parameters, out = undisturbed[0].parameters(), tmp_path / "s.zarr"
     folder, elsewhere = tmp_path / "s.manifests", tmp_path / "elsewhere"
     elsewhere.mkdir()
-    for name in ("build.json", "assets-00001.jsonl", "decoys.json", "link", "store"):
+    files = "build.json", "assets.jsonl", "assets-00001.jsonl", "decoys.json"
+    for name in (*files, "link", "store"):
         if name == "link":
             folder.symlink_to(elsewhere)
         elif name == "store":
@@ -223,8 +213,12 @@ def test_what_others_have_beside_a_store_is_refused_before_any_work(undisturbed,
             folder.mkdir()
             (folder / name).write_text('{"mine": 1}\n')
         before = tree(tmp_path)
-        with pytest.raises((StoreError, ConfigError), match=r"not slatprep's|is a link|is a store"):
+        told = rf"{name}.*not slatprep's" if name in files else f"is a {name}"
+        with pytest.raises((StoreError, ConfigError), match=told):
             build_store(parameters, out)
+        if name in files[:2]:
+            with pytest.raises(StoreError, match=told):
+                build_store(parameters, tmp_path / "o.zarr", manifests=folder)
         if name != "decoys.json":
             with pytest.raises((StoreError, ConfigError), match=r"s\.manifests"):
                 subset_store(undisturbed[1], out, ["a"])
@@ -257,7 +251,10 @@ def test_two_stores_in_a_folder_do_not_share_records(undisturbed, tmp_path):
         subset_store(first, second, ["a"])
     assert not second.exists()
     assert (tmp_path / "s.manifests" / "build.json").read_bytes() == records
-    build_store(parameters, second, manifests=tmp_path / "other")
+    build_store(parameters, second, manifests=tmp_path / "other" / "records")
+    names = {path.name for path in (tmp_path / "other" / "records").iterdir()}
+    assert names == {"assets.jsonl", "build.json", "sources.seen"}
+    assert (tmp_path / "s.manifests" / "build.json").read_bytes() == records
     build_store(parameters, first)
 
 

@@ -86,8 +86,7 @@ def test_a_file_that_was_written_just_now_has_no_lasting_state(on_a_disk, monkey
     # However slow this machine is.
     monkeypatch.setattr(states, "FINE_NS", 10**15)
     (on_a_disk / "a").write_bytes(b"content")
-    assert lasting(on_a_disk / "a") is None
-    assert States().of(str(on_a_disk / "a")) is not None
+    assert lasting(on_a_disk / "a") is None and States().of(str(on_a_disk / "a")) is not None
 
 
 @pytest.mark.parametrize("how", ["open", "appending", "mapped", "mapped and closed", "hard link"])

@@ -67,12 +67,10 @@ def test_an_asset_without_several_annotations_says_nothing_of_how_they_differ(ma
     store, _ = made
     for row, size in enumerate(SIZES):
         read = store.read(row, ["spread", "votes"])
-        assert read["spread"].shape == (size, 3)
-        assert read["votes"].shape == (size,)
+        assert read["spread"].shape == (size, 3) and read["votes"].shape == (size,)
         assert all(np.isnan(values).all() for values in read.values())
         assert read["spread"].dtype == read["votes"].dtype == np.float32
-    assert not store.merges
-    assert not store.asset("ant").merged
+    assert not store.merges and not store.asset("ant").merged
 
 
 def test_an_asset_of_several_annotations_says_how_they_differ(tmp_path):
@@ -137,10 +135,8 @@ def test_an_asset_is_found_by_a_beginning_that_no_other_has(made):
         store.find("cu")
     with pytest.raises(StoreError, match="3 is no id; expected a text, or `match`"):
         store.find(3)
-    assert [store.find(one) for one in IDS] == [0, 1, 2, 3]
-    assert "cup" in store
-    assert "cu" not in store
-    assert 3 not in store
+    assert [store.find(one) for one in IDS] == [0, 1, 2, 3] and "cup" in store
+    assert "cu" not in store and 3 not in store
 
 
 @pytest.mark.parametrize(
@@ -179,15 +175,8 @@ def test_assets_are_taken_by_number_id_beginning_and_slice(made):
 def test_a_notebook_shows_the_store_as_a_table(made):
     store, _ = made
     shown = store._repr_html_()
-    for name, value in (
-        ("assets", "4"),
-        ("assets good", "3"),
-        ("assets failed", "1"),
-        ("categories", "2"),
-        ("voxels", "23"),
-        ("ranges", "p1-p99"),
-        ("build", BUILD_ID[:12]),
-    ):
+    told = {"assets": 4, "assets good": 3, "assets failed": 1, "categories": 2, "voxels": 23}
+    for name, value in (told | {"ranges": "p1-p99", "build": BUILD_ID[:12]}).items():
         assert f"<tr><th>{name}</th><td>{value}</td></tr>" in shown
     assert repr(store) == f"<Store {store.path}: 4 assets (3 good, 1 failed), 23 voxels>"
     assert str(store.path) in shown
@@ -197,8 +186,7 @@ def test_a_notebook_shows_the_store_as_a_table(made):
 def test_a_store_that_cannot_be_read_says_so(own):
     (own / "asset" / "verdict" / "c" / "0").write_bytes(b"torn")
     damaged = open_store(own)
-    assert "cannot be read" in repr(damaged)
-    assert "cannot be read" in damaged._repr_html_()
+    assert "cannot be read" in repr(damaged) and "cannot be read" in damaged._repr_html_()
 
 
 def test_without_pandas_the_table_is_offered(made, monkeypatch):
@@ -242,21 +230,17 @@ def test_a_store_of_other_contents_is_read_by_its_own_tables(tmp_path):
     assert store.about.property_units == ("kg/m^3", "1")
     assert store.attributes["background"] == 254
     asset = store.asset("cup")
-    assert same(asset.feats, rows_of(arrays, "feats", 3))
-    assert asset.feats.shape == (7, 5)
-    assert asset.spread.shape == (7, 2)
-    assert asset.latents.resolution == 128
+    assert same(asset.feats, rows_of(arrays, "feats", 3)) and asset.feats.shape == (7, 5)
+    assert asset.spread.shape == (7, 2) and asset.latents.resolution == 128
     field = asset.normalised_field
-    assert len(field.voxels) == 12
-    assert field.occupancy.sum() == 14
+    assert len(field.voxels) == 12 and field.occupancy.sum() == 14
     assert field.material.tolist() == arrays["grid/material"][3, 3:9, 5:7, 23].ravel().tolist()
 
 
 def test_a_store_without_classes_has_fields_without(tmp_path):
     make_store(tmp_path / "s.zarr", Contents(classes=()))
     store = open_store(tmp_path / "s.zarr")
-    assert not store.asset("ant").field.classified
-    assert "background" not in store.attributes
+    assert not store.asset("ant").field.classified and "background" not in store.attributes
 
 
 def test_rows_beyond_what_an_asset_may_have_are_refused(own):

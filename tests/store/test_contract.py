@@ -40,8 +40,7 @@ def test_ids_offsets_and_voxels_are_the_source_files(root, mixed):
     assert [str(i) for i in root["asset/view"][:]] == ["", "front", "side", "", ""]
 
     offset = root["asset/offset"][:]
-    assert offset.dtype == np.int64
-    assert offset[0] == 0
+    assert offset.dtype == np.int64 and offset[0] == 0
     assert offset[-1] == root["voxel/coords"].shape[0]
     for row, asset_id in enumerate(IDS):
         rows = slice(offset[row], offset[row + 1])
@@ -57,8 +56,7 @@ def test_supervision_is_the_material_at_the_place_the_voxel_was_turned_from(root
         x, y, z = mixed.assets[asset_id].coords.astype(int).T
         true_material = mixed.assets[asset_id].grid[y, 63 - x, z, 3]
         assert np.array_equal(root["voxel/material"][rows], true_material)
-        assert root["voxel/valid"][rows].all()
-        assert root["voxel/distance"][rows].max() < 0.1
+        assert root["voxel/valid"][rows].all() and root["voxel/distance"][rows].max() < 0.1
         place = (np.stack([y, 63 - x, z], axis=1) + 0.5) / 64 - 0.5
         assert np.allclose(root["voxel/place"][rows], place, atol=0.1 / 64)
         expected = np.where((true_material == 0)[:, None], by_hand(JELLY), by_hand(METAL))

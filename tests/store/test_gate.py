@@ -241,9 +241,8 @@ import slatprep.cli.commands, slatprep.storage.remote
 assert not {{"fsspec", "s3fs"}} & set(sys.modules)
 del store
 """
-    told = subprocess.run(
-        [sys.executable, "-X", "dev", "-c", code], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-X", "dev", "-c", code]
+    told = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "ResourceWarning" not in told.stderr
 
 

@@ -26,13 +26,8 @@ NOT_THERE = 2**64 - 1
 
 
 def make(
-    folder: Path,
-    name: str,
-    values: np.ndarray,
-    chunk: int,
-    shard: int | None,
-    fill_value: float | str = 0,
-) -> zarr.Array:
+    folder: Path, name: str, values: np.ndarray, chunk: int, shard: int | None, fill: Any = 0
+) -> None:
     """Write an array by zarr alone, in shards of so many rows; chunks of fill values are none."""
     rest = values.shape[1:]
     root = zarr.open_group(folder, mode="a", zarr_format=3)
@@ -43,10 +38,9 @@ def make(
         chunks=(chunk, *rest),
         shards=None if shard is None else (shard, *rest),
         compressors=(ZstdCodec(level=1), Crc32cCodec()),
-        fill_value=fill_value,
+        fill_value=fill,
     )
     array[...] = values
-    return array
 
 
 def metadata_of(folder: Path, name: str) -> dict[str, Any]:
@@ -94,8 +88,7 @@ def test_every_range_of_rows_is_the_one_that_was_written(tmp_path, name):
     for start in range(len(values) + 1):
         for stop in range(start, len(values) + 1):
             rows = reader.read(start, stop)
-            assert rows.shape == values[start:stop].shape
-            assert rows.dtype == values.dtype
+            assert rows.shape == values[start:stop].shape and rows.dtype == values.dtype
             assert rows.tolist() == values[start:stop].tolist()
     for start, stop in ((-1, 1), (2, 1), (0, len(values) + 1)):
         with pytest.raises(StoreError, match=f"{len(values)} rows, not {start} to {stop}"):

@@ -23,8 +23,7 @@ def test_shards_take_every_row_of_every_asset_once_and_in_place(sizes, per_shard
 
     end = 0
     for start, stop in row_ranges(offsets[-1], per_shard):
-        assert start == end
-        assert start % per_shard == 0
+        assert start == end and start % per_shard == 0
         assert 0 < stop - start <= per_shard
         end = stop
         found = [

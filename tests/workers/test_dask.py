@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 from support.commands import run
-from support.dask_processes import Processes, end, threads_for_workers, wait_for_workers, wait_until
-from support.faults import flip
+from support.dask_processes import Processes, end, threads_for_workers, wait_for_workers
+from support.faults import flip, wait_until
 from support.synthetic import Dataset, Made
 from support.trees import tree
 

@@ -90,8 +90,7 @@ def test_single_threaded_holds_and_gives_back(monkeypatch):
             assert threads() == {1}
             assert os.environ["MKL_NUM_THREADS"] == "1"
         assert threads() == {2}
-    assert os.environ["OMP_NUM_THREADS"] == "2"
-    assert "MKL_NUM_THREADS" not in os.environ
+    assert os.environ["OMP_NUM_THREADS"] == "2" and "MKL_NUM_THREADS" not in os.environ
 
 
 def test_a_task_that_kills_its_worker_even_alone_is_answered_for():
@@ -135,8 +134,7 @@ def test_stopped_while_a_call_is_handed_over():
     pool = StoppedPool()
     with pytest.raises(KeyboardInterrupt):
         list(run_in_pools(pool, pool, abs, [(-1,)], None))
-    assert len(pool.handed_over) == 1
-    assert pool.abandoned == 1
+    assert len(pool.handed_over) == 1 and pool.abandoned == 1
 
 
 class QuickPool(StoppedPool):

@@ -56,8 +56,7 @@ def test_an_object_is_read_as_a_file(s3, bucket):
     path = place_of(f"s3://{bucket}") / "folder" / "text.txt"
     assert path.read_text("utf-8") == "Grüße\n"
     assert path.exists()
-    assert path.is_file()
-    assert not path.is_dir()
+    assert path.is_file() and not path.is_dir()
     assert path.parent.is_dir()
     assert storage_of(path).size() == 8
     with path.open("r", encoding="utf-8") as lines:
@@ -100,8 +99,7 @@ def test_objects_that_no_path_could_name_are_left_out(s3, bucket):
     assert storage_of(root).files() == {"a": 1, "b/c": 1}
     names = storage_of(root).listing()
     assert set(names.of_folder("", folders=False)) == {"a"}
-    assert set(names.of_folder("", folders=True)) == {"b"}
-    assert names.is_file("b/c")
+    assert set(names.of_folder("", folders=True)) == {"b"} and names.is_file("b/c")
     assert not names.is_file("b")
     with pytest.raises(Exception, match="no plain name below its root"):
         load_source(root / "b" / ".." / "a", root, "grid")
@@ -210,8 +208,6 @@ def test_where_the_folder_is(monkeypatch, tmp_path):
     folders = {VARIABLE: "own", "XDG_CACHE_HOME": "xdg", "HOME": "home"}
     for variable, folder in folders.items():
         monkeypatch.setenv(variable, str(tmp_path / folder))
-    for variable, found in zip(
-        folders, ("own", "xdg/slatprep", "home/.cache/slatprep"), strict=True
-    ):
+    for name, found in zip(folders, ("own", "xdg/slatprep", "home/.cache/slatprep"), strict=True):
         assert cache_folder() == tmp_path / found
-        monkeypatch.delenv(variable)
+        monkeypatch.delenv(name)

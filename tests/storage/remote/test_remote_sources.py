@@ -51,10 +51,9 @@ def test_a_root_that_is_not_there_is_named(uploaded, bucket, place, tmp_path):
     parameters = replace(uploaded, slat=SlatSource(place))
     with pytest.raises(ConfigError, match=f"^{place}: does not exist"):
         build_store(parameters, tmp_path / "s.zarr")
+    roots = {"pixieverse": {"root": str(uploaded.pixieverse.root)}, "slat": {"root": place}}
     with pytest.raises(ConfigError, match=f"slat.root: {place} does not exist"):
-        load_parameters(
-            None, {"pixieverse": {"root": str(uploaded.pixieverse.root)}, "slat": {"root": place}}
-        )
+        load_parameters(None, roots)
 
 
 def test_torn_and_lost_objects_cost_their_assets_alone(uploaded, s3, bucket, tmp_path, monkeypatch):
