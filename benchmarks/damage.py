@@ -32,6 +32,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.inspect.verify.manifests import manifest_findings
 from slatprep.pipeline import seen
 from slatprep.pipeline.dataset import build_store
+from slatprep.storage.arrays import ArrayFile
 from slatprep.storage.files import local_files
 from slatprep.store import open_store
 from slatprep.store.integrity import file_findings, metadata_findings
@@ -153,7 +155,8 @@ def flip(bench: Bench, number: int) -> None:
             bench.told["found, and the next build"] += 1
             heal(bench, what, verified=True)
         if file.name == seen.NAME:  # It tells a build what not to hash, and nothing else.
-            believed, _ = seen.read_seen(bench.manifests, content[32:64])
+            bound = ArrayFile(BytesIO(content))["bound"].tobytes()
+            believed, _ = seen.read_seen(bench.manifests, bound)
             if number % SEEN_EVERY == 0 or believed:
                 heal(bench, what, verified=False)
             outcome = "costs the next build some hashing"

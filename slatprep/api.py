@@ -88,7 +88,7 @@ def align_voxels(
     )
     feats = np.zeros((len(target), 8), dtype=np.float32)
     latents = StructuredLatents(target, feats, resolution=resolution)
-    return align(field, latents, checked(parameters or AlignParameters()))
+    return align(field, latents, checked(AlignParameters, parameters or AlignParameters()))
 
 
 def annotate_voxels(
@@ -133,7 +133,7 @@ def annotate_voxels(
     else:
         place_map = PlaceMap(np.asarray(transform, dtype=np.float64))
     places = place_map.places(_voxels(coords, "coords", resolution), resolution)
-    return sample(field, places, checked(parameters or SampleParameters()))
+    return sample(field, places, checked(SampleParameters, parameters or SampleParameters()))
 
 
 def _voxels(voxels: ArrayLike, name: str, side: int = RESOLUTION) -> NDArray[np.uint8]:

@@ -31,7 +31,6 @@ MAX_ALSO = 15
 MAX_SHARD_CHUNKS = 2**20
 """Chunks per shard; a reader keeps their index in memory."""
 
-
 NAMED_SPLITS, CATEGORY = ("hash", "pixie"), "category:"
 """Words that `NormalizeParameters.split_by` may be or begin with, besides a path."""
 

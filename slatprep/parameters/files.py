@@ -15,6 +15,8 @@ from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_args, get_type_hints
 
+import numpy as np
+
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import (
     CATEGORY,
@@ -42,6 +44,8 @@ _MOST, _MOST_KEYS = 2**53, 5
 """The largest whole number that every reader of JSON keeps, and the deepest nesting."""
 
 _UNKNOWN_KEY = "unexpected_keyword_argument"
+
+_Group = TypeVar("_Group", AlignParameters, SampleParameters, BuildParameters)
 
 OPTIONS = {
     "pixieverse.root": "--pixieverse",
@@ -89,9 +93,6 @@ def load_parameters(
         If the file cannot be read, or a key or value makes no sense. The message names the
         file or option, the key and the value, and what is allowed.
     """
-    # Late: pydantic takes a third of a second that `slatprep --help` does not have.
-    from pydantic import ValidationError
-
     config = None if config is None else Path(config)
     data = {} if config is None else _read(config)
     if preset is not None:
@@ -105,6 +106,23 @@ def load_parameters(
         if isinstance(values, Mapping) and not isinstance(table, dict):
             raise ConfigError(f"{origin.of(group)}: {group}: expected a table [{group}]")
         data[group] = table | values if isinstance(values, Mapping) else values
+    parameters = _validated(BuildParameters, data, origin)
+    _check_paths(parameters, origin)
+    return parameters
+
+
+def checked(kind: type[_Group], given: _Group) -> _Group:
+    """Return parameters made in Python, checked as those of a file; ConfigError as there."""
+    if not isinstance(given, kind):
+        raise ConfigError(f"parameters are {given!r:.80}; expected those of load_parameters")
+    return _validated(kind, asdict(given), _Origin(kind.__name__, {}))
+
+
+def _validated(kind: type[_Group], data: Mapping[str, Any], origin: _Origin) -> _Group:
+    """Return parameters of tables of values; ConfigError where one makes no sense."""
+    # Late: pydantic takes a third of a second that `slatprep --help` does not have.
+    from pydantic import ValidationError
+
     for name, table, key in _paths_of(data):
         path = str(table[key])
         if path != in_unicode(path):
@@ -114,31 +132,18 @@ def load_parameters(
             )
     # Through JSON, because strict JSON takes a list for a tuple and a string
     # for a path as TOML has them, and still refuses "3" and true for 3.0.
-    document = json.dumps(data, default=str)
+    document = json.dumps(data, default=_plain)
     try:
-        parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
-            document, strict=True
-        )
+        parameters: _Group = adapter_of(kind).validate_json(document, strict=True)  # type: ignore[arg-type]
     except ValidationError as error:
         # One line, one repair: a misspelt key first, because it makes another one missing.
         faults = sorted(error.errors(), key=lambda fault: fault["type"] != _UNKNOWN_KEY)
         raise ConfigError(_explain(faults[0], origin)) from None
-    _check_paths(parameters, origin)
     return parameters
 
 
-_Group = TypeVar("_Group", AlignParameters, SampleParameters)
-
-
-def checked(group: _Group) -> _Group:
-    """Return parameters made in Python, checked as those of a file; ConfigError as there."""
-    from pydantic import ValidationError
-
-    try:
-        found: _Group = adapter_of(type(group)).validate_python(asdict(group))  # type: ignore[arg-type]
-    except ValidationError as error:
-        raise ConfigError(_explain(error.errors()[0], _Origin(type(group).__name__, {}))) from None
-    return found
+def _plain(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 class _Origin(NamedTuple):

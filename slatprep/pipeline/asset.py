@@ -133,11 +133,9 @@ def _repeated(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> 
 
 
 def _key(asset: Finished, recipe: Recipe) -> str:
-    if asset.digests:
-        return recipe.key(asset.pair.asset_id, asset.digests)
     sources = asset.field.sources + asset.latents.sources
     shared = asset.latents if asset.pair.slat_group else None
-    digests = source_digests(sources, shared) | reading_of(asset.pair.roots)
+    digests = asset.digests or source_digests(sources, shared) | reading_of(asset.pair.roots)
     return recipe.key(asset.pair.asset_id, digests)
 
 
@@ -170,7 +168,6 @@ WHEN = (
     else "in each process, as no cache folder can be written to (NUMBA_CACHE_DIR names one)"
 )
 """When kernels are compiled, for the user."""
-
 
 _FIRST_SHARE = 0.013
 """Share of the time of all kernels that the first of them takes, by which the time is foretold."""

@@ -26,7 +26,7 @@ from slatprep.pipeline.seen import bound_to, look, read_seen, write_seen
 from slatprep.readers import hash_sources, reading_of
 from slatprep.records import AssetPair, Place, SourceRoots
 from slatprep.storage.place import storage_of
-from slatprep.storage.states import is_settled, settle
+from slatprep.storage.states import is_old, wait_until_old
 from slatprep.store import Store, open_store
 from slatprep.store.reader import is_store
 from slatprep.store.records import BUILD, file_names
@@ -38,28 +38,14 @@ SHARE = 0.01
 
 @dataclass(eq=False)
 class Before:
-    """What is there before a build.
+    """What is there before a build of these pairs to a place.
 
-    Attributes
-    ----------
-    place : Destination
-        Where the store lies, and its records.
-    pairs : sequence of AssetPair
-        The dataset.
-    wanted : Wanted
-        What the build is asked for.
-    previous : SourceStore or None
-        The store that is there. Its files have been read once it is checked.
-    known : mapping of str to (bytes, str)
-        State and key of the assets whose sources are as the last build saw them.
-    as_left : bool
-        Whether the files of store and records are as the last build left them.
-    damaged : tuple of str
-        What of the store is not as it was written.
-    unnoticed : tuple of str
-        Ids of assets whose sources are other ones, though their states are as they were.
-    seed : int or None
-        What the assets were drawn with whose sources were hashed all the same; None if none was.
+    The files of `previous`, the store that is there, have been read once it is checked. It was
+    `built` if a build is known to have made it, and not a choice among another's assets. Its files
+    and records are `as_left` by the last build, or else `damaged` is what is not as it was written.
+    `known` has state and key of the assets whose sources are as the last build saw them. `seed`
+    drew those that were hashed all the same; None if none was. `unnoticed` are ids of assets whose
+    sources are other ones, though their states are as they were.
     """
 
     place: Destination
@@ -67,6 +53,7 @@ class Before:
     wanted: Wanted
     previous: SourceStore | None = None
     known: Mapping[str, tuple[bytes, str]] = field(default_factory=dict)
+    built: bool = False
     as_left: bool = False
     damaged: tuple[str, ...] = ()
     unnoticed: tuple[str, ...] = ()
@@ -116,7 +103,7 @@ class Before:
         seen = {row.asset_id: row.seen for row in rows}
         states = [seen.get(asset_id, b"") for asset_id in store.ids]
         folder, bound = _seen_folder(self.place), self._bound_to(store)
-        write_seen(folder, bound, state, states, map(bytes, store.column("key")))
+        write_seen(folder, bound, state, states, store.column("key"))
 
     def _bound_to(self, store: Store) -> bytes:
         """Return what states hold for: this machine, a build's store, and how it was read."""
@@ -172,7 +159,7 @@ def look_back(
         before.damaged = (str(error),) if is_store(place.store) else ()
         return before
     keys, state = read_seen(_seen_folder(place), before._bound_to(previous))
-    before.as_left = before._is_as_left(previous, state)
+    before.built, before.as_left = bool(state), before._is_as_left(previous, state)
     states = look(pairs) if keys and rehash < 1 else {}
     before.known = {name: (own, keys[own]) for name, own in states.items() if own in keys}
     before._sample(rehash, seed, crew)
@@ -189,7 +176,7 @@ def _store_state(place: Destination, manifests: Place, assets: int, wait: bool =
     if folder is None or store is None:
         return b""
     if wait:
-        settle()
+        wait_until_old()
     digest = hashlib.sha256()
     files = [Path(found, name) for found, _, names in os.walk(store) for name in names]
     records = (folder / name for name in (*file_names(assets), BUILD))
@@ -199,7 +186,7 @@ def _store_state(place: Destination, manifests: Place, assets: int, wait: bool =
         except OSError:
             return b""
         times = state.st_mtime_ns, state.st_ctime_ns
-        if not is_settled(*times):
+        if not is_old(*times):
             return b""
         digest.update(repr((str(file), state.st_size, *times, state.st_ino)).encode())
     return digest.digest()

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slatprep.errors import ConfigError
+from slatprep.errors import SlatprepError
 from slatprep.parameters import BuildParameters
+from slatprep.parameters.files import checked
 from slatprep.pipeline.before import SHARE, Before, look_back
 from slatprep.pipeline.decoys import DECOYS, measure_build, writable_file
 from slatprep.pipeline.notices import dataset_notices, much_clipped
@@ -33,7 +34,7 @@ from slatprep.pipeline.publish import (
     BuildSummary,
     Destination,
     counts_of,
-    publish_store,
+    publish_build,
     require_records_file,
     summarise,
 )
@@ -126,7 +127,7 @@ def build_store(
     Raises
     ------
     ConfigError
-        If `out` is something other than a store, or `parameters` are of another type.
+        If `out` is something other than a store, or a parameter makes no sense.
     StoreError
         If another build is writing it, no asset can be used, or the disk does not take what is
         written.
@@ -134,8 +135,7 @@ def build_store(
         With `strict`, for the first asset that cannot be used.
     """
     begin = time.perf_counter()
-    if not isinstance(parameters, BuildParameters):
-        raise ConfigError(f"parameters are {parameters!r:.80}; expected those of load_parameters")
+    parameters = checked(BuildParameters, parameters)
     crew = Crew(jobs, assets_per_job, progress, note)
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
     if decoys:
@@ -155,6 +155,7 @@ def build_store(
         if before.suffices and not keep_work:
             return _publish(before, begin)
         before.check(crew.of(len(pairs)))
+        place.there = before.previous
         context = BuildContext(parameters, wanted.recipe, work.spool, before.previous, strict)
         plan = plan_assets(pairs, context, crew, before.known)
         assets = _finish_all(pairs, plan, context, crew, None if keep_work else before)
@@ -169,7 +170,8 @@ def build_store(
             aligned = sum(plan[one].action is not Action.REUSE for one in new.ids)
             try:
                 measure_build(open_store(place.in_place()), aligned, decoys, crew, before.previous)
-            except Exception as error:  # The store is published, and stays so.
+            except (SlatprepError, OSError, ArithmeticError, ValueError, MemoryError) as error:
+                # What data and machines bring about; the store is published, and stays so.
                 told = f"errors were not measured ({error}); run `slatprep measure-errors`"
                 summary = replace(summary, warnings=(*summary.warnings, told))
     return summary
@@ -233,6 +235,7 @@ def plan_build(
     progress: Progress | None = None,
 ) -> BuildPlan:
     """Say what `build_store` would do with each asset, and why; nothing is written."""
+    parameters = checked(BuildParameters, parameters)
     place, wanted = Destination(out, manifests), Wanted.of(parameters)
     crew = Crew(jobs, progress=progress)
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
@@ -264,6 +267,7 @@ def align_pairs(
     file of something else than records.
     """
     begin = time.perf_counter()
+    parameters = checked(BuildParameters, parameters)
     require_records_file(Path(out))
     out, crew = Path(out), Crew(jobs, assets_per_job, progress, note)
     with work_beside(out.absolute(), arrays=False) as work:
@@ -325,7 +329,7 @@ def _publish(
     if new and records is not None:
         warnings += [*dataset_notices(new, parameters, failed), *much_clipped(store)]
     damaged = [f"{row.asset_id}: {row.damaged}" for row in rows if row.damaged]
-    summary = publish_store(
+    summary = publish_build(
         place,
         store,
         parameters,

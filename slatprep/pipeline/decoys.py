@@ -58,18 +58,11 @@ _MAX_BYTES = 64 * 2**20
 
 @dataclass(frozen=True)
 class Decoy:
-    """An asset's grid with another one's SLAT.
+    """An asset's grid with another one's SLAT, both by their ids.
 
-    Attributes
-    ----------
-    grid, slat : str
-        Ids of the assets.
-    keys : tuple of str
-        What these two were made from and how.
-    verdict : str
-        What the alignment is called, as that of an asset would be.
-    evidence : tuple of float
-        `slatprep.judge.evidence.FIGURES` of their alignment; empty before it is aligned.
+    `keys` say what these two were made from and how. `verdict` is what the alignment is called, as
+    that of an asset would be. `evidence` has its `slatprep.judge.evidence.FIGURES`, empty before it
+    is aligned.
     """
 
     grid: str

@@ -39,7 +39,6 @@ _NOT_NUMBERS = (
 # these make values of them.
 _DECODING = ("slatprep.storage.chunks",)
 
-
 PACKING = (
     "slatprep.normalize",
     "slatprep.pipeline.pack",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -19,8 +20,8 @@ import orjson
 from slatprep.errors import ConfigError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.pack import pack_store
-from slatprep.pipeline.publish import BuildSummary, Destination, publish_store
-from slatprep.pipeline.rows import NextStore, Row, SourceStore
+from slatprep.pipeline.publish import BuildSummary, Destination, publish_build
+from slatprep.pipeline.rows import NextStore, Row, SourceStore, in_order
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange, words_of
@@ -34,7 +35,6 @@ from slatprep.workers.local import Jobs, at_most
 
 NO_ROOT, APART = "unknown", " | "
 """The root that a build's record gives for unknown sources, and what separates several roots."""
-
 
 _ROWS_A_JOB = 256
 """No more processes are started than there are so many rows for."""
@@ -82,12 +82,13 @@ def subset_store(
     """
     source = _source(store)
     everything = _rows([source])
-    rows = [everything[row] for row in {source.match(name) for name in words_of(assets)}]
+    chosen = {source.match(name) for name in words_of(assets)}
+    rows = in_order([everything[row] for row in chosen], None, compact=True)
     if not rows:
         raise ConfigError(f"no asset of {source.path} is chosen; expected one at least")
     place, parameters = Destination(out, manifests), _parameters([source], source.build)
     how = source.normalization, source.contents, source.build, parameters.store
-    return _write(NextStore(_by_id(rows), (source,), *how), parameters, place, jobs, progress)
+    return _write(NextStore(rows, (source,), *how), parameters, place, jobs, progress)
 
 
 def concat_stores(
@@ -139,7 +140,8 @@ def concat_stores(
     build, contents = _common_build(sources), _common_contents(sources, rows)
     place, parameters = Destination(out, manifests), _parameters(sources, build)
     how = _common_ranges(sources), contents, build, parameters.store
-    return _write(NextStore(_by_id(rows), tuple(sources), *how), parameters, place, jobs, progress)
+    rows = in_order(rows, None, compact=True)
+    return _write(NextStore(rows, tuple(sources), *how), parameters, place, jobs, progress)
 
 
 def _source(store: Store | str | Place) -> SourceStore:
@@ -157,10 +159,6 @@ def _rows(sources: Sequence[SourceStore]) -> list[Row]:
     ]
 
 
-def _by_id(rows: Iterable[Row]) -> list[Row]:
-    return sorted(rows, key=lambda row: row.asset_id)
-
-
 def _write(
     new: NextStore,
     parameters: BuildParameters,
@@ -176,7 +174,7 @@ def _write(
     _require_unclipped(new)
     with work_beside(place.store, look=place.look) as work:
         pack_store(work, place, new, at_most(len(new.rows) // _ROWS_A_JOB, jobs), progress)
-        return publish_store(place, open_store(place.in_place()), parameters, begin)
+        return publish_build(place, open_store(place.in_place()), parameters, begin)
 
 
 def _require_unclipped(new: NextStore) -> None:
@@ -201,18 +199,13 @@ def _same_place(one: Place, other: Place) -> bool:
 def _places_of_sources(store: SourceStore) -> dict[str, Any]:
     """Return where a store's sources lay; nothing where no record beside it is of its build."""
     folder = manifests_beside(store.path)
-    if folder is None:
-        return {}
-    try:
-        record = build_in(folder)
-    except StoreError:
-        return {}  # The store does not need it, and `slatprep verify` names it.
-    if record.id != store.about.manifest:
-        return {}
-    names = ("pixieverse", "also", "slat", "pairing")
-    named = {name: getattr(record.parameters, name) for name in names}
-    places: dict[str, Any] = orjson.loads(orjson.dumps(named, default=str))
-    return places
+    with suppress(StoreError):  # The store does not need it, and `slatprep verify` names it.
+        record = folder and build_in(folder)
+        if record and record.id == store.about.manifest:
+            names = ("pixieverse", "also", "slat", "pairing")
+            named = {name: getattr(record.parameters, name) for name in names}
+            return dict(orjson.loads(orjson.dumps(named, default=str)))
+    return {}
 
 
 def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildParameters:

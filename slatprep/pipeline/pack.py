@@ -50,7 +50,6 @@ Arrays = dict[str, NDArray[Any]]
 _ROWS_MOVED = 65_536
 """Rows of an older store that are unpacked at a time, 4 MB in all arrays."""
 
-
 _CLIPPED = {"voxel": "clipped", "grid": "clipped_grid"}
 """Columns of what packing a group clips."""
 
@@ -70,7 +69,7 @@ def pack_store(
     with writing(str(place.out), work_directory(place.store).parent):
         path = work.scratch / "store.zarr"
         staged, records = _made(path, new, work, jobs, progress)
-        place.replace(path, staged)
+        place.replace(path, new.ids, staged)
     return records
 
 

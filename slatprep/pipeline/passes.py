@@ -45,8 +45,7 @@ class Reopened:
 
     def __init__(self, asset: Row, spool: Spool) -> None:
         self._asset, self._spool = asset, spool
-        self.record, self.field = spool.record(asset.key), spool.field(asset.key)
-        self.latents, self.annotation = spool.looked_up(asset.key)
+        self.record, self.field, self.latents, self.annotation = spool.asset(asset.key)
         self.alignment, self.judgement = self.record.alignment, self.record.judgement
 
     def place(self, alignment: Alignment, parameters: BuildParameters) -> None:

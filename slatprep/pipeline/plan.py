@@ -36,16 +36,9 @@ Note = Callable[[str], None]
 class Crew:
     """Who works on a build, and who is told of it.
 
-    Attributes
-    ----------
-    jobs : int or Workers
-        Worker processes, or a cluster's.
-    assets_per_job : int
-        No more processes are started than there are so many assets for.
-    progress : callable or None
-        Called with the assets done and the assets in all; at the beginning with none done.
-    note : callable or None
-        See `Note`.
+    `jobs` are worker processes, or a cluster's workers; no more processes are started than there
+    are `assets_per_job` assets for each. `progress` is called with the assets done and those in
+    all, at the beginning with none done. `note` gets lines for the user.
     """
 
     jobs: Jobs
@@ -67,18 +60,8 @@ class Crew:
 class BuildContext:
     """A build, as its tasks see it.
 
-    Attributes
-    ----------
-    parameters : BuildParameters
-        The build's.
-    recipe : Recipe
-        What they and the code come to.
-    spool : Spool
-        Where finished assets go.
-    previous : SourceStore or None
-        The store that is there.
-    strict : bool
-        Raise an asset's fault instead of noting it.
+    `recipe` is what parameters and code come to, `spool` where finished assets go, and `previous`
+    the store that is there. With `strict`, an asset's fault is raised instead of noted.
     """
 
     parameters: BuildParameters
@@ -89,7 +72,12 @@ class BuildContext:
 
 
 class Action(StrEnum):
-    """What a build does with an asset."""
+    """What a build does with an asset.
+
+    ``align``: from its sources to the spool. ``reuse``: its alignment is in the existing store.
+    ``resume``: an interrupted build finished it. ``refuse``: it cannot go in. ``remove``: it is in
+    the store but no longer in the dataset.
+    """
 
     ALIGN = "align"
     REUSE = "reuse"
@@ -100,25 +88,11 @@ class Action(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlannedAsset:
-    """What will be done with one asset.
+    """What will be done with one asset, and the reason in one line.
 
-    Attributes
-    ----------
-    asset_id : str
-        Id of the row.
-    action : Action
-        ``align``: from its sources to the spool. ``reuse``: its alignment is
-        in the existing store. ``resume``: an interrupted build finished
-        it. ``refuse``: it cannot go in. ``remove``: it is in the store but no
-        longer in the dataset.
-    reason : str
-        Why, in one line.
-    key : str
-        See `slatprep.pipeline.recipe`; empty where the sources cannot be read.
-    names : mapping of str to object, or None
-        Those that its record has otherwise, such as its category or the paths of its files.
-    seen : bytes
-        State of its sources as they were hashed; empty where nobody looked.
+    `key` is empty where the sources cannot be read. `names` are those that its record has
+    otherwise, such as its category or the paths of its files. `seen` is the state of its sources as
+    they were hashed, empty where nobody looked.
     """
 
     asset_id: str
@@ -131,16 +105,9 @@ class PlannedAsset:
 
 @dataclass(frozen=True)
 class BuildPlan:
-    """What a build will do.
+    """What a build will do with the `assets`, sorted by id, to make or replace a `store`.
 
-    Attributes
-    ----------
-    store : Place
-        The store to make or replace.
-    assets : tuple of PlannedAsset
-        Sorted by id.
-    damaged : tuple of str
-        What of the existing store is not as it was written, and will be made anew.
+    `damaged` is what of the existing store is not as it was written, and will be made anew.
     """
 
     store: Place

@@ -58,9 +58,10 @@ class Destination:
     """Where a store and its records go; `store` is where it really lies, behind a link.
 
     `out` is the store as its user names it, `manifests` the folder of its records, if not beside
-    it. `removed` is how many assets of the store that was there the new one lacks. StoreError if
-    there is something other than a store, or the folder holds files of other origin or the records
-    of another store; ConfigError if it lies in another store.
+    it. `there` is the store that is there, where it is open already; `removed` is how many of its
+    assets the new one lacks. StoreError if there is something other than a store, or the folder
+    holds files of other origin or the records of another store; ConfigError if it lies in another
+    store.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
@@ -81,6 +82,7 @@ class Destination:
                 _require_own(folder, path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
+        self.there: Store | None = None
         self.replacing = False
         self.removed = 0
 
@@ -100,14 +102,14 @@ class Destination:
             told = f"{self.out} is the old store or the new one, whole; run it again"
             raise KeyboardInterrupt(told) from None
 
-    def replace(self, new: Path, staged: Staged | None = None) -> None:
-        """Put a finished store in place; on an object store it is not published yet.
+    def replace(self, new: Path, ids: Iterable[str], staged: Staged | None = None) -> None:
+        """Put a finished store with these ids in place; on an object store not published yet.
 
         `staged` is what of it is on the object store already.
         """
         self.replacing = True
         with suppress(StoreError):  # There was none, or its ids cannot be read.
-            self.removed = len(set(open_store(self.store).ids) - set(open_store(new).ids))
+            self.removed = len(set((self.there or open_store(self.store)).ids) - set(ids))
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)
         elif (path := storage_of(self.store).local) is not None:
@@ -316,7 +318,7 @@ def summarise(
     )
 
 
-def publish_store(
+def publish_build(
     place: Destination,
     store: Store,
     parameters: BuildParameters,

@@ -50,6 +50,8 @@ class SourceStore(Store):
         document = {"attributes": store.attributes, "consolidated_metadata": gathered}
         super().__init__(store.path, document)
         self.damaged = damaged
+        # Not of itself: files of what holds itself stay open until garbage is collected.
+        self.records = StoredRecords(store)
         # A process that lives on must not answer with what it read of an older store at the same
         # path, whose rows may have been in another order under the same id.
         self._run = uuid.uuid4().hex
@@ -66,11 +68,6 @@ class SourceStore(Store):
     def files(self) -> dict[str, Written]:
         """Bytes and SHA-256 of its files by name, as it holds them."""
         return digests_in(self)
-
-    @cached_property
-    def records(self) -> StoredRecords:
-        """Its records."""
-        return StoredRecords(self)
 
     def record(self, asset_id: str) -> AssetRecord | None:
         """Return the record of an asset as its first pass left it, None where it is not there.
@@ -140,7 +137,6 @@ MOST_BEHIND = 0.1
 """The most assets that an update adds behind the others, as a share of those. To pack a row that is
 there takes a tenth of the time that a new asset takes."""
 
-
 Names = Mapping[str, Any]
 """What an asset and its files are called now, by field of its record; no part of the work."""
 
@@ -149,28 +145,12 @@ Names = Mapping[str, Any]
 class Row:
     """An asset that goes into a store, and where its arrays lie.
 
-    Attributes
-    ----------
-    asset_id : str
-        Id of the row.
-    n_voxels : int
-        Its SLAT voxels.
-    key : str
-        Names its file in the spool.
-    columns : mapping of str to object
-        What its record says in ``asset/*`` by last name, of a row in the spool; ``n_valid`` and
-        ``n_placements``, its distinct placements that fit about as well, ``unusual``, what is
-        unusual of its values, and ``grid``, the digest of its grid, too.
-    store : int
-        Which of the stores that rows are taken from has it; `IN_SPOOL` where none.
-    row : int
-        Its row there.
-    names : mapping of str to object, or None
-        Those that its record there has otherwise.
-    damaged : str
-        Why, in words, what an older store holds of it was not taken over.
-    seen : bytes
-        State of its sources as they were read; empty where they were not.
+    In the spool, `key` names its file, and `columns` has what its record says in ``asset/*`` by
+    last name. There are also ``n_valid``; ``n_placements``, its distinct placements that fit about
+    as well; ``unusual``, what is unusual of its values; ``grid``, the digest of its grid. Otherwise
+    it is a `row` of one of the stores that rows are taken from, and `names` are those that its
+    record there has otherwise. `damaged` says why what an older store holds of it was not taken
+    over. `seen` is the state of its sources as they were read, empty where they were not.
     """
 
     asset_id: str
@@ -211,23 +191,9 @@ def moments_of(rows: Sequence[Row], stores: Sequence[SourceStore]) -> list[Laten
 class NextStore:
     """A store that is to be written.
 
-    Attributes
-    ----------
-    rows : sequence of Row
-        Its assets, in its order.
-    stores : tuple of SourceStore
-        Those that rows are taken from.
-    normalization : Normalization
-        The ranges of its properties.
-    contents : Contents
-        What it holds.
-    build : mapping
-        Its attribute ``build``.
-    parameters : StoreParameters
-        Sizes of its chunks and shards.
-    replaces : bool
-        Whether it takes the place of the one store that rows are taken from, so that the two
-        may have files in common.
+    It has `rows` in their order, some of them taken from `stores`, and ranges, contents, the
+    attribute `build`, and sizes of chunks and shards. It `replaces` the one store that rows are
+    taken from, if the two may have files in common.
     """
 
     rows: Sequence[Row]

@@ -2,9 +2,8 @@
 
 `slatprep.storage.states` says when a state of a source proves that its content is the same. It is
 taken as the source is read, and beside it stands the key that the content gave. The file
-`NAME` lies beside the records of a build, with a digest of its own; it holds for this machine,
-this store and the same code and parameters. Where anything of that is otherwise, the sources are
-hashed.
+`NAME` lies beside the records of a build; it holds for this machine, this store and the same code
+and parameters. Where anything of that is otherwise, the sources are hashed.
 """
 
 from __future__ import annotations
@@ -12,13 +11,18 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from io import BufferedReader
 from pathlib import Path
 
+import numpy as np
 import orjson
+from numpy.typing import NDArray
 
-from slatprep.errors import InputError
+from slatprep.errors import InputError, StoreError
 from slatprep.readers.slat import texture_of
 from slatprep.records import AssetPair, Place
+from slatprep.storage.arrays import ArrayFile, write_arrays
 from slatprep.storage.files import open_regular, private_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.states import Noted, States, boot_id
@@ -26,10 +30,8 @@ from slatprep.storage.states import Noted, States, boot_id
 NAME = "sources.seen"
 """Of the file, in the folder of the records, or on this machine's disk where those are not."""
 
-_DIGEST, _STATE = 32, 16
-"""Bytes of a digest, of which three come before the rows, and of a state."""
-
-_FORMAT = "slatprep-seen-4"
+_FORMAT = "slatprep-seen-5"
+_STATE = 16
 _UNKNOWN = bytes(_STATE)
 
 
@@ -37,44 +39,35 @@ def read_seen(folder: Path, bound: bytes) -> tuple[dict[bytes, str], bytes]:
     """Read what the last build saw; nothing where no whole file is bound to the same.
 
     Returns the key of each of the store's assets by the state of its sources, and the state of the
-    store's files and records when it was finished; 32 zeros if that state was not known.
+    store's files and records when it was finished; zeros if that state was not known.
     """
     try:
-        with open_regular(folder / NAME) as file:
-            data = file.read()
-    except OSError:
+        with BufferedReader(open_regular(folder / NAME)) as file:
+            seen = dict(ArrayFile(file))
+        if seen["bound"].tobytes() != bound:
+            return {}, b""
+        pairs = zip(seen["states"], seen["keys"], strict=True)
+        keys = {state.tobytes(): key.tobytes().hex() for state, key in pairs}
+        keys.pop(_UNKNOWN, None)
+        return keys, seen["store"].tobytes()
+    except (OSError, StoreError, LookupError, ValueError):
         return {}, b""
-    digest, held, store = (data[at : at + _DIGEST] for at in range(0, 3 * _DIGEST, _DIGEST))
-    if not store or _digest(data[_DIGEST:]) != digest or held != bound:
-        return {}, b""
-    keys = {}
-    for at in range(3 * _DIGEST, len(data), _STATE + _DIGEST):
-        end = at + _STATE
-        keys[data[at:end]] = data[end : end + _DIGEST].hex()
-    keys.pop(_UNKNOWN, None)
-    return keys, store
 
 
 def write_seen(
-    folder: Path, bound: bytes, store: bytes, states: Iterable[bytes], keys: Iterable[bytes]
+    folder: Path, bound: bytes, store: bytes, states: Iterable[bytes], keys: NDArray[np.uint8]
 ) -> None:
     """Note the state of the sources of each asset of a store, empty where unknown, and its key.
 
-    The file is written in place: half of one is noticed by its digest, and costs
+    The file is written in place: half of one is noticed by its checksums, and costs
     the next build some hashing. So does a disk that does not take it.
     """
-    rows = b"".join((own or _UNKNOWN) + key for own, key in zip(states, keys, strict=True))
-    body = bound + (store or bytes(_DIGEST)) + rows
-    try:
-        with private_file(folder / NAME) as file:
-            file.write(_digest(body) + body)
-    except OSError:
-        return
-
-
-def _digest(body: bytes) -> bytes:
-    """Return the digest of a file, which one of another form does not have."""
-    return hashlib.sha256(_FORMAT.encode() + body).digest()
+    held = b"".join(own or _UNKNOWN for own in states)
+    texts = {"bound": bound, "store": store or bytes(32), "states": held}
+    arrays = {name: np.frombuffer(text, np.uint8) for name, text in texts.items()}
+    arrays |= {"states": arrays["states"].reshape(-1, _STATE), "keys": keys}
+    with suppress(OSError), private_file(folder / NAME) as file:
+        write_arrays(file, arrays)
 
 
 def bound_to(build_id: str, recipe: str) -> bytes:

@@ -128,9 +128,16 @@ class Spool:
         storage.remove(n for n in ours if n not in kept and (n == mark or not others))
         return others
 
-    def record(self, key: str) -> AssetRecord:
-        """Read an asset's record back."""
-        return read_asset_record(self.record_text(key), str(self._path(key)))
+    def asset(self, key: str) -> tuple[AssetRecord, MaterialField, StructuredLatents, Annotation]:
+        """Read an asset back: its record, field and SLAT, and what was looked up at its voxels."""
+        with self._open(key) as arrays:
+            text, field, voxels = arrays["record"].tobytes(), _field_in(arrays), _voxels_in(arrays)
+            resolution = int(arrays["slat_resolution"])
+        latents = StructuredLatents(
+            voxels.pop("coords"), voxels.pop("feats"), resolution=resolution
+        )
+        record = read_asset_record(text, str(self._path(key)))
+        return record, field, latents, Annotation(**voxels)
 
     def record_text(self, key: str) -> bytes:
         """Read an asset's record back as its JSON, unchecked."""
@@ -141,34 +148,12 @@ class Spool:
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""
         with self._open(key) as arrays:
-            there = (name for name in ("coords", "feats", *_ANNOTATION) if name in arrays)
-            return {name: arrays[name] for name in there}
-
-    def looked_up(self, key: str) -> tuple[StructuredLatents, Annotation]:
-        """Read an asset's SLAT, without its sources, and what was looked up at its voxels."""
-        arrays = self.voxels(key)
-        with self._open(key) as file:
-            resolution = int(file["slat_resolution"])
-        latents = StructuredLatents(
-            arrays.pop("coords"), arrays.pop("feats"), resolution=resolution
-        )
-        return latents, Annotation(**arrays)
+            return _voxels_in(arrays)
 
     def field(self, key: str) -> MaterialField:
         """Read an asset's PixieVerse field, without its sources."""
         with self._open(key) as arrays:
-            return MaterialField(
-                occupancy=np.unpackbits(arrays["grid_occupancy"])
-                .astype(bool)
-                .reshape((RESOLUTION,) * 3),
-                voxels=arrays["grid_voxels"],
-                material=arrays["grid_material"],
-                properties=arrays["grid_properties"],
-                table=tuple(
-                    Property(p[0], p[1], p[2] == "True") for p in arrays["grid_table"].tolist()
-                ),
-                classified=bool(arrays["grid_classified"]),
-            )
+            return _field_in(arrays)
 
     def _path(self, key: str) -> Place:
         return self.directory / key[:2] / f"{key}.arrays"
@@ -194,6 +179,24 @@ class Spool:
             return storage_of(place).staged()
         path.parent.mkdir(exist_ok=True)
         return staged_apart(path, path.parent)
+
+
+def _voxels_in(arrays: ArrayFile) -> Arrays:
+    there = (name for name in ("coords", "feats", *_ANNOTATION) if name in arrays)
+    return {name: arrays[name] for name in there}
+
+
+def _field_in(arrays: ArrayFile) -> MaterialField:
+    occupancy = np.unpackbits(arrays["grid_occupancy"]).astype(bool)
+    table = arrays["grid_table"].tolist()
+    return MaterialField(
+        occupancy=occupancy.reshape((RESOLUTION,) * 3),
+        voxels=arrays["grid_voxels"],
+        material=arrays["grid_material"],
+        properties=arrays["grid_properties"],
+        table=tuple(Property(name, unit, log10 == "True") for name, unit, log10 in table),
+        classified=bool(arrays["grid_classified"]),
+    )
 
 
 def row_of(record: AssetRecord, text: bytes, extent: NDArray[np.float64]) -> Row:

@@ -44,16 +44,10 @@ LOCK, _PREFIX = "lock", "build-"
 class Work:
     """Where a build works.
 
-    Attributes
-    ----------
-    spool : Spool
-        Finished assets; outlives a build that is interrupted.
-    scratch : Path
-        A folder of this build alone, with a name that no other build had.
-    shards : Place
-        Where workers put the shards of the new store.
-    mark : str
-        Object of a spool below a store that says that this build is at work; else empty.
+    The `spool` of finished assets outlives a build that is interrupted. `scratch` is a folder of
+    this build alone, with a name that no other build had. Workers put the shards of the new store
+    below `shards`. The object `mark` of a spool below a store says that this build is at work; else
+    it is empty.
     """
 
     spool: Spool

@@ -76,34 +76,26 @@ def _null_is_nan(value: float | None) -> float:
 Share = Annotated[float, Ge(0), Le(1)]
 """A share, 0 to 1."""
 
-
 Count = Annotated[int, Ge(0), Le(2**53)]
 """A count, 0 to the largest whole number that every reader of JSON keeps."""
-
 
 Number = Annotated[float, InJson({"type": "nullable", "schema": _FINITE}, _null_is_nan)]
 """A number that may be NaN, which is null in JSON."""
 
-
 Digest = Annotated[str, InJson({"type": "str", "pattern": "^[0-9a-f]{64}$"})]
 """SHA-256 in hex."""
-
 
 Transform = Annotated[NDArray[np.float64], _invertible()]
 """Homogeneous, (4, 4): PixieVerse frame to SLAT frame, a similarity."""
 
-
 Rotation = Annotated[NDArray[np.float64], _array(3, 3)]
 """(3, 3), orthogonal."""
-
 
 AffineMap = Annotated[NDArray[np.float64], _array(3, 4)]
 """(3, 4): x -> A x + b."""
 
-
 Point = Annotated[NDArray[np.float64], _array(3)]
 """(3,), edges of the unit cube."""
-
 
 Lattice = Annotated[NDArray[np.float64], _array(None, None, None, 3)]
 """(n0, n1, n2, 3): a vector at each point of a lattice of at most 32 points a side."""

@@ -101,7 +101,6 @@ LOG10 = "log10 "
 FACTORS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "kg/m^3": 1.0, "g/cm^3": 1e3}
 """What a value in a unit is multiplied by to be in SI units."""
 
-
 _FACTOR = {"": 1.0, "1": 1.0} | FACTORS
 
 
@@ -117,10 +116,7 @@ def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
 class Units:
     """Units of the values in the files of a source; empty where nobody stated them.
 
-    Attributes
-    ----------
-    youngs_modulus, density : str
-        Unit of each. What is stated is not asked about.
+    What is stated is not asked about.
     """
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}

@@ -22,16 +22,13 @@ from slatprep.records.json_types import InJson
 RESOLUTION = 64
 """Voxels along each axis of both frames."""
 
-
 MAX_NAME_BYTES = 1024
 """Most bytes of an id, view, category or file name in UTF-8."""
-
 
 FEATS_MEAN = (
     -2.1687545776367188, -0.004347046371549368, -0.13352349400520325, -0.08418072760105133,
     -0.5271206498146057, 0.7238689064979553, -1.1414450407028198, 1.2039363384246826,
 )  # fmt: skip
-
 
 FEATS_STD = (
     2.377650737762451, 2.386378288269043, 2.124418020248413, 2.1748552322387695,
@@ -39,18 +36,14 @@ FEATS_STD = (
 )  # fmt: skip
 """Mean and deviation per channel that TRELLIS publishes for ``slat_flow_img_dit_L_64l8p2_fp16``."""
 
-
 BACKGROUND = 7
 """Material id of an empty voxel, unless a store has more classes than this number."""
-
 
 MANY_BACKGROUND = 254
 """Material id of an empty voxel in a store with more classes; also the most classes."""
 
-
 UNANNOTATED = 255
 """Material id of an occupied voxel that carries no annotation (-1 in raw grids)."""
-
 
 CLASS_COLOURS = {
     "jelly": "#5A9A5A",
@@ -70,10 +63,8 @@ for Simulation of Color Vision Deficiency", IEEE TVCG 2009), any two of them
 differ by more than 20 in CIELAB.
 """
 
-
 MATERIAL_CLASSES = tuple(CLASS_COLOURS)
 """PhysGaussian's material classes, by id."""
-
 
 UNANNOTATED_COLOUR = "#FFFFFF"
 """Colour of an occupied voxel without an annotation."""
@@ -101,7 +92,6 @@ COLOURS = np.zeros((256, 3), dtype=np.uint8)
 """Red, green and blue of every material id."""
 for _material, _colour in MATERIAL_COLOURS.items():
     COLOURS[_material] = tuple(bytes.fromhex(_colour[1:]))
-
 
 _Words = TypeVar("_Words", bound=Iterable[object])
 
@@ -165,7 +155,6 @@ MAX_LATENT_RESOLUTION = 256
 
 PropertyName = Annotated[str, InJson({"type": "str", "pattern": r"^[a-z][a-z0-9_]{0,63}$"})]
 """Name of a property: lower-case letters, digits and ``_``, a letter first."""
-
 
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_ -]{0,63}")
 ClassName = Annotated[str, InJson({"type": "str", "pattern": f"^{CLASS_NAME.pattern}$"})]
@@ -300,22 +289,9 @@ TRELLIS = LatentSpace("trellis", 8, RESOLUTION, FEATS_MEAN, FEATS_STD)
 
 
 def labels_of(classes: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the classes that a voxel may have: for PhysGaussian's, all but the background.
+    """Return the classes that a voxel may have, by id: for PhysGaussian's, all but the background.
 
-    Parameters
-    ----------
-    classes : tuple of str
-        Names of the classes.
-
-    Returns
-    -------
-    tuple of str
-        Names by id.
-
-    Raises
-    ------
-    ValueError
-        If a store cannot tell so many apart, or their names are not unique.
+    ValueError if a store cannot tell so many apart, or their names are not unique.
     """
     if classes == MATERIAL_CLASSES:
         return classes[:BACKGROUND]

@@ -49,20 +49,11 @@ def is_archive(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Archive:
-    """An archive as it was when it was looked at.
+    """An archive as it was when it was looked at; on the hub, at one commit.
 
-    Attributes
-    ----------
-    place : Place
-        Where it lies; on the hub, at one commit.
-    stamp : str
-        What tells it from one that lay there before, or will later.
-    size : int
-        Its bytes.
-    trusted : bool
-        Whether a later change is sure to change the stamp.
-    wanted : tuple of str
-        Patterns of the members that may be asked for, see `is_wanted`.
+    Its `stamp` tells it from one that lay there before, or will later; it is `trusted` if a later
+    change is sure to change that. `size` is in bytes. `wanted` are patterns of the members that may
+    be asked for, see `is_wanted`.
     """
 
     place: Place
@@ -201,22 +192,10 @@ class Archive:
 class Index:
     """The members of an archive by name, as far as it was read.
 
-    Attributes
-    ----------
-    members : dict of str to Entry
-        A name that occurs twice stands for the last, as in unpacking.
-    next : int
-        Where the next header begins.
-    complete : bool
-        Whether there are no more.
-    fault : str
-        Why no more can be read; empty where all is well.
-    strange : list of str
-        Names of members that lead out of the archive.
-    twice : int
-        Members that a later one of the same name replaces.
-    wanted : list of str
-        Patterns of the members that it has all of; without any, it has all members.
+    A name that occurs `twice` stands for the last, as in unpacking. `next` is where the next header
+    begins, `complete` whether there are no more, `fault` why no more can be read. `strange` are
+    names of members that lead out of the archive. It has all members that match `wanted`, or all
+    without.
     """
 
     members: dict[str, Entry] = field(default_factory=dict)

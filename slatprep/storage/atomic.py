@@ -30,7 +30,6 @@ from slatprep.storage.files import OWN_FILE, is_at, is_only_ours, locks_alone
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 

@@ -35,18 +35,9 @@ MAX_TEXT_BYTES = 64 * 2**20
 class ChunkDecoder:
     """The codecs of an array's chunks, as far as this module knows them.
 
-    Attributes
-    ----------
-    dtype : numpy.dtype
-        Little-endian, as stored; object for text.
-    shape : tuple of int
-        Shape of a chunk.
-    compressor : str
-        ``blosc``, ``zstd`` or empty.
-    crc32c : bool
-        Whether a checksum ends each chunk.
-    text : int
-        Mean bytes that the strings (``vlen-utf8``) of a chunk may have; 0 for numbers.
+    `dtype` is little-endian, as stored, and object for text; `shape` is that of a chunk. The
+    `compressor` is ``blosc``, ``zstd`` or empty. A checksum ends each chunk if `crc32c`. The
+    strings (``vlen-utf8``) of a chunk may have `text` bytes on average; it is 0 for numbers.
     """
 
     dtype: np.dtype[Any]

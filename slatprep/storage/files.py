@@ -23,7 +23,6 @@ from urllib.parse import quote
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-
 _AT = os.open in os.supports_dir_fd
 _NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a writer
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)

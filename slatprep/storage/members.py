@@ -177,7 +177,6 @@ class MemberListing(RemoteListing):
 _GAP, _MOST = 2**18, 2**24
 """Bytes between members that are read with them; bytes of one request with several members."""
 
-
 Members = list[Entry]
 
 

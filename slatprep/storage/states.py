@@ -110,14 +110,14 @@ def boot_id() -> str:
         return ""
 
 
-def is_settled(modified_ns: int, changed_ns: int) -> bool:
+def is_old(modified_ns: int, changed_ns: int) -> bool:
     """Whether a change from now on gives a file other times than these."""
     newest = max(modified_ns, changed_ns)
     return newest + (FINE_NS if newest % 1_000_000 else COARSE_NS) <= time.time_ns()
 
 
-def settle() -> None:
-    """Wait until what was written before is settled, where times are fine."""
+def wait_until_old() -> None:
+    """Wait until what was written before is old, where times are fine."""
     time.sleep(FINE_NS / 1e9)
 
 
@@ -129,7 +129,7 @@ def lasting_state(descriptor: int) -> State | None:
     if not _nobody_writes(descriptor):
         return None
     state = (_noting.get() or States()).of(descriptor)
-    return state if state and is_settled(state.modified, state.changed) else None
+    return state if state and is_old(state.modified, state.changed) else None
 
 
 @contextmanager

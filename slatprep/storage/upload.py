@@ -47,20 +47,10 @@ _MD5 = re.compile(r"[0-9a-f]{32}(-[0-9]+)?")
 
 @dataclass(frozen=True)
 class Staged:
-    """Files of a version that are on the object store already.
+    """Files of a version that are on the object store already: bytes and SHA-256 in hex by name.
 
-    Attributes
-    ----------
-    sizes : dict of str to int
-        Bytes of the files by name.
-    digests : dict of str to str
-        Their SHA-256 in hex.
-    version : RemotePlace or None
-        The version into which workers put some of them.
-    before : RemotePlace or None
-        The version from which the server is to copy the others.
-    copied : frozenset of str
-        Names of those.
+    Workers put some of them into `version`. The server is to copy the others, which are named in
+    `copied`, from the version `before`.
     """
 
     sizes: Mapping[str, int]
@@ -72,17 +62,7 @@ class Staged:
 
 @dataclass(frozen=True)
 class PublishedState:
-    """The pointer at the beginning of a build.
-
-    Attributes
-    ----------
-    target : RemotePlace
-        The store.
-    pointer : Pointer or None
-        Its content; None if it did not exist.
-    tag : str
-        The server's tag of this state.
-    """
+    """The pointer of a store at the beginning of a build, if any, and the server's tag of it."""
 
     target: RemotePlace
     pointer: versions.Pointer | None

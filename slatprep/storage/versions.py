@@ -35,7 +35,7 @@ FORMAT = "slatprep-store-pointer"
 
 # Whoever wrote the pointer chose the names, and they lead to objects.
 _NAME = re.compile(r"[0-9a-f]{16}")
-_SPOOLED = re.compile(rf"{BUILDER}-[0-9a-f]{{16}}|[0-9a-z]{{2}}/(none-)?[0-9a-f]{{32,64}}\.arrays")
+_SPOOLED = re.compile(rf"{BUILDER}-[0-9a-f]{{16}}|[0-9a-f]{{2}}/[0-9a-f]{{64}}\.arrays")
 _MAX_POINTER_BYTES = 2**16
 
 
@@ -43,16 +43,9 @@ _MAX_POINTER_BYTES = 2**16
 class Pointer:
     """The content of a store's pointer.
 
-    Attributes
-    ----------
-    version : str
-        Name of the version to read.
-    previous : str
-        The version before, kept for its readers; may be empty.
-    content : str
-        SHA-256 in hex over names and content of the version's files.
-    published : str
-        Time of publication, in UTC.
+    `version` is the name of the one to read, `previous` that of the one before, kept for its
+    readers, or empty. `content` is the SHA-256 in hex over names and content of the version's
+    files, `published` the time in UTC.
     """
 
     version: str

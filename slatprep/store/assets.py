@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     import pandas
     import zarr
 
-
 ASSET_COLUMNS = [
     name
     for layout in ARRAYS
@@ -49,13 +48,8 @@ class AttributesError(StoreError):
 class AssetTable:
     """The assets of a store as a table, which `slatprep.store.Store` adds their voxels to.
 
-    Parameters
-    ----------
-    path : Place
-        Where the store lies.
-    document : dict
-        The root's ``zarr.json``. `metadata` are those of its arrays that it repeats, or that have
-        been read since.
+    It lies at `path`, and `document` is the root's ``zarr.json``. `metadata` are those of its
+    arrays that it repeats, or that have been read since.
     """
 
     def __init__(self, path: Place, document: dict[str, Any]) -> None:
@@ -170,7 +164,7 @@ class AssetTable:
     @cached_property
     def offsets(self) -> NDArray[np.int64]:
         """Asset a owns rows ``offsets[a]:offsets[a+1]`` of ``voxel/*``, int64 (A+1,)."""
-        return np.asarray(self.column("offset"), np.int64)
+        return self.cached_column("offset")
 
     def column(self, name: str) -> NDArray[Any]:
         """Read one ``asset/*`` array whole, (A, ...), by its last name.

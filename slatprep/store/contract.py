@@ -42,18 +42,10 @@ _ZARR_NAMES = {"str": "string"}
 
 @dataclass(frozen=True, order=True)
 class Finding:
-    """One thing that is wrong.
+    """One thing that is wrong, and what should be there.
 
-    Attributes
-    ----------
-    file : str
-        File below the store, or a file of the records or sources.
-    asset : str
-        Asset concerned; empty where it is the store as a whole.
-    what : str
-        What is wrong, with the value at fault.
-    expected : str
-        What should be there.
+    `file` lies below the store, or is one of the records or sources. `asset` is empty where the
+    store as a whole is concerned. `what` is wrong is told with the value at fault.
     """
 
     file: str
@@ -192,7 +184,6 @@ _SETTINGS: dict[str, Any] = {
     },
 }
 """Configurations of codecs, see `_has_form`; those of others are empty."""
-
 
 _GATE: dict[str, Any] = {"zarr_format": 3, "attributes": dict}
 _ARRAY_GATE: dict[str, Any] = {

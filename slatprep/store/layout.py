@@ -161,7 +161,6 @@ MERGED = (
 )  # fmt: skip
 """Further arrays of a store in which labels of any asset are merged of several annotations."""
 
-
 RECORDS = ArrayLayout(RECORD_ARRAY, "str", ("asset",), "", "provenance of the row, as JSON")
 
 FILES = (
@@ -195,7 +194,6 @@ FIXED_SIZES = {
     **dict.fromkeys(_XYZ, RESOLUTION),
 }
 """Dimensions that are the same in every store."""
-
 
 MOST_SHARDS = 32
 """Shards of a voxel array of a store that is not very large. An update writes the last one anew,

@@ -334,7 +334,7 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
             f"{path} has format version {version!r}; this slatprep reads {FORMAT_VERSION}. "
             "Use the slatprep that wrote it, or a newer one"
         )
-    store = Store(path, document)
+    store = Store(path.absolute(), document)  # The working folder may change.
     # Refused when opened, not halfway through a command.
     for finding in width_findings(store.about, store.metadata):
         raise AttributesError(f"{path}/{finding}; run `slatprep verify`")

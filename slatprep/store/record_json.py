@@ -24,7 +24,6 @@ from slatprep.store.record import AssetRecord, BuildRecord, Record
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
-
 FOLDER = Path(__file__).with_name("schema")
 
 _FAULTS = 64

@@ -24,16 +24,9 @@ Piece = tuple[Run | None, int, int]
 
 @dataclass(frozen=True)
 class Runs:
-    """The runs of a new array.
+    """The runs of an array of `new` rows, ascending and without overlap.
 
-    Attributes
-    ----------
-    runs : tuple of Run
-        Ascending, without overlap.
-    new : int
-        Rows of the new array.
-    old : tuple of int
-        Rows of the array of each older store.
+    `old` are the rows of the array in each older store.
     """
 
     runs: tuple[Run, ...] = ()

@@ -36,7 +36,6 @@ _COPIED_BYTES = 4 * 2**20
 MAX_CHUNK_BYTES = 256 * 2**20
 """What one chunk may unpack to; a grid's takes 3 MiB."""
 
-
 BAD_METADATA = (
     ArithmeticError,  # A fill value beyond its data type.
     AttributeError,
@@ -46,7 +45,6 @@ BAD_METADATA = (
     ValueError,
 )
 """What Python, numpy and zarr-python raise for metadata that make no sense."""
-
 
 MAX_TEXT = {RECORD_ARRAY: MAX_RECORD_BYTES}
 """What the texts of a chunk may have on average, where that is more than a name may have."""
@@ -75,24 +73,10 @@ class _Shard:
 
 @dataclass(eq=False)
 class RowReader:
-    """Reads rows of one array; safe to share between threads and across a fork.
+    """Reads rows of one array of a store; safe to share between threads and across a fork.
 
-    Parameters
-    ----------
-    folder : Folder
-        The store.
-    name : str
-        Name of the array, such as ``voxel/feats``.
-    shape : tuple of int
-        Shape of the array.
-    shard_rows : int
-        Rows of one file.
-    sharded : bool
-        Whether the file has an index, or is one chunk.
-    decoder : ChunkDecoder
-        For its chunks.
-    fill_value : object
-        What a chunk that was never written holds.
+    A file has `shard_rows` rows, and an index if it is `sharded`; else it is one chunk. A chunk
+    that was never written holds the `fill_value`.
     """
 
     folder: Folder

@@ -137,7 +137,7 @@ def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]
     """Return what packs a chunk as the codecs of a ``zarr.json`` say."""
     from numcodecs import Blosc, VLenUTF8, Zstd
 
-    first, packer, _ = codecs  # RowReader takes no others than these, with a checksum last.
+    first, packer, _ = codecs  # `create_store` gives every array these two and a checksum.
     settings = packer["configuration"]
     if packer["name"] == "zstd":
         zstd = Zstd(settings["level"], settings["checksum"])

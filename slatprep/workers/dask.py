@@ -162,12 +162,7 @@ class Cluster:
 class _Common:
     """What a worker must have in common with this process.
 
-    Attributes
-    ----------
-    software : tuple of (str, str)
-        Names and versions of what computes.
-    files : tuple of (str, str)
-        Paths of files and folders, and the result of `_look` for each.
+    `software` has names and versions of what computes, `files` paths and what `_look` says of each.
     """
 
     software: tuple[tuple[str, str], ...]

@@ -9,7 +9,7 @@ from support.trees import records_of, tree
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreError
 from slatprep.inspect.verify import verify_store
-from slatprep.pipeline.dataset import align_pairs, build_store
+from slatprep.pipeline.dataset import align_pairs, build_store, plan_build
 from slatprep.store import open_store
 from slatprep.store.records import build_in, manifests_beside
 
@@ -84,6 +84,26 @@ def test_a_build_stopped_as_it_begins_leaves_nothing(make_dataset, tmp_path, mon
 def test_folders_instead_of_parameters_are_answered_with_what_to_give(tmp_path):
     with pytest.raises(ConfigError, match="parameters are 'grids'; expected those of load_param"):
         build_store("grids", tmp_path / "s.zarr")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("group", "wrong", "said"),
+    [
+        ("align", {"engine": "zz"}, r"align\.engine: got 'zz'; expected 'field'"),
+        ("store", {"voxel_chunk": 0}, r"store\.voxel_chunk: got 0; expected greater than 0"),
+        ("sample", {"max_distance": np.nan}, r"sample\.max_distance: got nan"),
+        ("pixieverse", {"samples": "some"}, r"pixieverse\.samples: got 'some'"),
+        ("slat", {"root": None}, r"slat\.root: got None"),
+    ],
+)
+def test_parameters_that_make_no_sense_are_refused_at_each_door(
+    make_dataset, tmp_path, group, wrong, said
+):
+    parameters = make_dataset().parameters(**{group: wrong})
+    for door in (build_store, plan_build, align_pairs):
+        with pytest.raises(ConfigError, match=f"^BuildParameters: {said}"):
+            door(parameters, tmp_path / "out")
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_is_not_a_store_is_never_replaced(make_dataset, tmp_path):

@@ -39,17 +39,22 @@ def test_a_subset_is_the_build_of_its_assets(folder, tmp_path):
     assert records_of(tmp_path / "s.manifests" / "assets.jsonl") == built
 
 
-def test_an_update_of_a_subset_has_the_ranges_of_its_own_dataset(make_dataset, tmp_path):
+@pytest.mark.parametrize("ranges", ["dataset", "p1-p99", "dataset of train"])
+def test_an_update_of_a_subset_has_the_ranges_of_its_own_dataset(make_dataset, tmp_path, ranges):
     dataset, out = make_dataset("a", "b"), tmp_path / "s.zarr"
     grid = dataset.assets["b"].grid
     grid[..., 1] *= 2  # Else all assets have the same ranges.
     dataset.write_grid("b", grid)
-    build_store(dataset.parameters(), tmp_path / "all.zarr")
+    named, _, trained = ranges.partition(" of ")
+    (lists := tmp_path / "lists.json").write_text('{"train": ["a", "b"]}')
+    how: dict[str, object] = {"objects": "train", "split_by": str(lists)} if trained else {}
+    parameters = dataset.parameters(named, normalize=how)
+    build_store(parameters, tmp_path / "all.zarr")
     subset_store(tmp_path / "all.zarr", out, ["a"])
     assert open_store(out).normalization == open_store(tmp_path / "all.zarr").normalization
     dataset.remove("b")
-    build_store(dataset.parameters(), out)
-    build_store(dataset.parameters(), tmp_path / "first.zarr")
+    build_store(parameters, out)
+    build_store(parameters, tmp_path / "first.zarr")
     assert tree(out) == tree(tmp_path / "first.zarr")
 
 

@@ -1,10 +1,12 @@
 """What did not change is taken over: files, chunks and rows, checked, and only then."""
 
+import gc
 import json
 import os
 import pickle
 import random
 import shutil
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from string import ascii_lowercase
@@ -351,6 +353,18 @@ def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(built, step
     build_store(dataset.parameters(), out)
     assert names(steps, "asset aligned") == []
     assert tree(out) == tree_from_nothing(dataset.parameters())
+
+
+def test_files_of_a_store_that_nobody_needs_are_closed_at_once(built):
+    source = SourceStore(open_store(built[1]))
+    assert source.record("a") is not None
+    there = weakref.ref(source)
+    gc.disable()
+    try:
+        del source
+        assert there() is None
+    finally:
+        gc.enable()
 
 
 def test_a_worker_that_lives_on_reads_the_store_of_today(built):

@@ -1,5 +1,6 @@
 """A store's table of assets, and each asset, against the arrays that zarr wrote."""
 
+import pickle
 import shutil
 import sys
 from pathlib import Path
@@ -114,6 +115,8 @@ def test_what_is_changed_in_an_asset_or_table_changes_nothing_in_the_store(made)
     np.testing.assert_array_equal(store[0].transform, before)
     with pytest.raises(ValueError, match="read-only"):
         store.table()["verdict"][:] = "failed"
+    with pytest.raises(ValueError, match="read-only"):
+        store.offsets[1] = 7
 
 
 def test_properties_are_found_by_name(made):
@@ -170,6 +173,15 @@ def test_assets_are_taken_by_number_id_beginning_and_slice(made):
     assert same(store.read(IDS[0])["coords"], store.read(0)["coords"])
     with pytest.raises(StoreError, match=r"has no column 'coordz'; did you mean coords\?"):
         store.read(0, columns=("coordz",))
+
+
+def test_a_store_opened_by_a_relative_path_is_the_same_from_another_folder(made, monkeypatch):
+    store = made[0]
+    monkeypatch.chdir(store.path.parent)
+    opened = open_store(store.path.name)
+    monkeypatch.chdir("/")
+    assert pickle.loads(pickle.dumps(opened)).ids == store.ids
+    assert opened.group["asset/id"].shape == (len(store),)
 
 
 def test_a_notebook_shows_the_store_as_a_table(made):

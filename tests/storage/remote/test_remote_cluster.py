@@ -127,7 +127,7 @@ def test_what_others_keep_beside_a_spool_is_refused_and_stays(s3, url, undisturb
     assert contents(s3, url).keys() == {"spool/notes.txt"}
 
 
-ASSET = f"ab/ab{'0' * 30}.arrays"
+ASSET = f"ab/ab{'0' * 62}.arrays"
 
 
 def test_a_build_elsewhere_keeps_its_finished_assets_to_its_end(s3, url, tmp_path, monkeypatch):
