@@ -11,9 +11,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.geometry.frames import Array
 from slatprep.records import Agreement
-
-Array = NDArray[np.float64]
 
 BLOCK = 8.0
 """Edge of a block of space, in voxels."""

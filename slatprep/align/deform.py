@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.align.figures import CHECK_SAMPLES, FIT_SAMPLES, fit_figures
 from slatprep.align.pose import Similarity
@@ -21,8 +20,6 @@ from slatprep.align.warp import Warp, from_nearest, halved
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model
-
-Array = NDArray[np.float64]
 
 TRIAL_SAMPLES = 600
 """Samples a side of the trial; half of them are held out."""

@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.equations import invert
-from slatprep.align.interpolation import interpolate
+from slatprep.align.equations import interpolate, invert
 from slatprep.align.warp import NO_SPACING
 from slatprep.geometry.bspline import bend, gather, locate, scatter, strides_of
 from slatprep.geometry.kernel import kernel
@@ -49,13 +48,7 @@ class Lines(NamedTuple):
 
     def rows(self, chosen: slice | NDArray[np.intp]) -> Lines:
         """Return some rows; a slice shares memory."""
-        return Lines(
-            self.places[chosen],
-            self.bases[chosen],
-            self.weights[chosen],
-            self.vectors[chosen],
-            self.residuals[chosen],
-        )
+        return Lines._make(numbers[chosen] for numbers in self)
 
 
 @kernel()
@@ -69,13 +62,9 @@ def linearise(here, there, pose, warp, lines, forward, tau):  # type: ignore[no-
     columns, values, field, field_origin = here.columns, here.values, there.distance, there.origin
     places, bases, weights = lines.places, lines.bases, lines.weights
     vectors, residuals = lines.vectors, lines.residuals
-    rotation, shift, scale, offset = pose.rotation, pose.shift, pose.scale, warp.offset
-    affine, origin, spacing, coefficients = (
-        warp.affine,
-        warp.origin,
-        warp.spacing,
-        warp.coefficients,
-    )
+    rotation, shift, scale = pose.rotation, pose.shift, pose.scale
+    affine, offset, origin = warp.affine, warp.offset, warp.origin
+    spacing, coefficients = warp.spacing, warp.coefficients
     bent = spacing < NO_SPACING
     inverse = np.zeros((3, 3))
     invert(affine, inverse)

@@ -129,7 +129,7 @@ def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
     best = tied[0]
     # What was found of those near says more than the scores that they had before.
     others = pair.others(best, [*tied[1:], *(pose for pose in poses if pose not in near)])
-
+    rivals = [pose.behind for pose in others if pose.merit > best.merit - reach]
     starts = zip(distinct_starts(), fits, strict=True)
     fitted = {start.index: (fit.fitness, fit.rmse) for start, fit in starts}
     transform = best.similarity.transform
@@ -149,12 +149,7 @@ def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
         ),
         score=best.score,
         deformation=deformed.deformation,
-        figures=_figures(
-            pair,
-            best,
-            deformed,
-            np.fmin.reduce([p.behind for p in others if p.merit > best.merit - reach], initial=nan),
-        ),
+        figures=_figures(pair, best, deformed, np.fmin.reduce(rivals, initial=nan)),
     )
 
 

@@ -18,7 +18,6 @@ from slatprep.align.pair import (
     RANK_SAMPLES,
     RANK_STANDING,
     TIE,
-    Array,
     Pair,
     far_apart,
     scale_penalty,
@@ -26,6 +25,7 @@ from slatprep.align.pair import (
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.warp import Warp, places_of
+from slatprep.geometry.frames import Array
 from slatprep.records import FitFigures, Model
 
 MOST_CONTESTED = 4
@@ -98,26 +98,20 @@ def as_free(pair: Pair, fits: Sequence[Deformed]) -> list[Deformed]:
 def _told_apart(
     pair: Pair, best: Deformed, poses: Sequence[Pose], fits: Sequence[Deformed]
 ) -> list[Pose]:
-    """Return poses with how far they are behind the best, by their fits."""
-    behind = standard_errors(pair, best, fits)
-    return [replace(pose, behind=by) for pose, by in zip(poses, behind, strict=True)]
-
-
-def standard_errors(pair: Pair, best: Deformed, others: Sequence[Deformed]) -> list[float]:
-    """Say by how many standard errors the best fits better than each of some others.
+    """Return poses with by how many standard errors the best fits better than their fits.
 
     All are looked at on the same samples, so what the two sides differ in anyway cancels out.
     Samples of one block of space err together: blocks are counted, not samples.
     """
-    if not others:
+    if not poses:
         return []
     kernels, places = _kernels(pair, best)
     blocks = blocks_of(places)
     found = []
-    for other in others:
-        gains = np.bincount(blocks, kernels - _kernels(pair, other)[0])
+    for pose, fit in zip(poses, fits, strict=True):
+        gains = np.bincount(blocks, kernels - _kernels(pair, fit)[0])
         spread = float(np.sqrt((gains**2).sum()))
-        found.append(float(gains.sum()) / spread if spread else 0.0)
+        found.append(replace(pose, behind=float(gains.sum()) / spread if spread else 0.0))
     return found
 
 

@@ -11,15 +11,13 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.align.pose import Pose, Poses, Similarity
 from slatprep.align.solver import solve
 from slatprep.align.surface import Surface
+from slatprep.geometry.frames import Array
 from slatprep.geometry.kernel import kernel
 from slatprep.parameters import AlignParameters
-
-Array = NDArray[np.float64]
 
 COARSE_SAMPLES, POLISH_SAMPLES, FINE_SAMPLES = 100, 400, 2_000
 """Samples a side used from the starts, on the survivors, and at the end."""

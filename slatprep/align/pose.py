@@ -8,11 +8,8 @@ from math import nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slatprep.geometry.frames import VOXEL_SIZE, make_transform, split_transform
-
-Array = NDArray[np.float64]
+from slatprep.geometry.frames import VOXEL_SIZE, Array, make_transform, split_transform
 
 
 class Similarity(NamedTuple):

@@ -18,8 +18,7 @@ from slatprep.align.pose import Poses, Similarity
 from slatprep.align.stretch import stretch
 from slatprep.align.surface import Samples, Surface, normals_of
 from slatprep.align.warp import Warp
-
-Array = NDArray[np.float64]
+from slatprep.geometry.frames import Array
 
 BLOCK = 8.0
 """Edge, in voxels, of the blocks of space that are fitted and held out in turn."""

@@ -115,14 +115,6 @@ def so3_starts(count: int) -> NDArray[np.float64]:
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
     alpha, beta = 2.0 * np.pi * s / phi, 2.0 * np.pi * s / psi
-    quaternions = np.stack(
-        [
-            inner * np.sin(alpha),
-            inner * np.cos(alpha),
-            outer * np.sin(beta),
-            outer * np.cos(beta),
-        ],
-        axis=1,
-    )
-    rotations: NDArray[np.float64] = Rotation.from_quat(quaternions).as_matrix()
+    planes = inner * [np.sin(alpha), np.cos(alpha)], outer * [np.sin(beta), np.cos(beta)]
+    rotations: NDArray[np.float64] = Rotation.from_quat(np.concatenate(planes).T).as_matrix()
     return rotations

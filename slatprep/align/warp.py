@@ -5,16 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.align.pose import Similarity
 from slatprep.geometry.bspline import displacements, refined
 from slatprep.geometry.deformation import make_deformation
-from slatprep.geometry.frames import VOXEL_SIZE, nearest_similarity, split_transform
+from slatprep.geometry.frames import VOXEL_SIZE, Array, nearest_similarity, split_transform
 from slatprep.records import Deformation
-
-Array = NDArray[np.float64]
-
 
 NO_SPACING = 1e6
 """Of a warp without a lattice."""

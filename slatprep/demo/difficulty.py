@@ -25,9 +25,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slatprep.demo.generated import Distortion, Waves, draw_distortion
-from slatprep.demo.model import Array, Rng, direction
+from slatprep.demo.model import Rng, direction
 from slatprep.demo.shapes import Solid, bounding_box
-from slatprep.geometry.frames import VOXEL_SIZE, cube_symmetries, make_transform
+from slatprep.geometry.frames import VOXEL_SIZE, Array, cube_symmetries, make_transform
 
 # Slightly smaller than the cube, so that no surface lies exactly on its faces.
 _FULL = 1.0 - 1e-4

@@ -12,8 +12,8 @@ from typing import Self
 
 import numpy as np
 
-from slatprep.demo.model import Array, Rng, direction
-from slatprep.geometry.frames import VOXEL_SIZE
+from slatprep.demo.model import Rng, direction
+from slatprep.geometry.frames import VOXEL_SIZE, Array
 
 _LARGEST_SLOPE = 0.7
 """Bound on the change of a bend per distance; below 1 the map does not fold."""

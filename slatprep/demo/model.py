@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slatprep.demo.shapes import Part, Shape, Stuff, capsule, carve, cone, polytope
-from slatprep.geometry.frames import even_directions
+from slatprep.geometry.frames import Array, even_directions
 
 Rng = np.random.Generator
-Array = NDArray[np.float64]
 Range = tuple[float, float]
 
 JELLY, METAL, SAND, VISPLAS, FLUID, SNOW, STATIONARY = range(7)

@@ -9,11 +9,9 @@ axis, and a point beyond it is displaced as the nearest point of the domain is.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slatprep.geometry.frames import Array
 from slatprep.geometry.kernel import kernel
-
-Array = NDArray[np.float64]
 
 
 @kernel(inline="always")

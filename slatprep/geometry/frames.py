@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.records import RESOLUTION
 from slatprep.records.json_types import MAX_SHEAR
 
+Array = NDArray[np.float64]
+
 VOXEL_SIZE = 1.0 / RESOLUTION
 """Edge of a voxel in the unit cube."""
 

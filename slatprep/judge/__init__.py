@@ -1,23 +1,9 @@
 """What an alignment is worth: what ties would change, how sure it is, and a verdict in one word."""
 
-from __future__ import annotations
-
-from slatprep.judge.ambiguity import measure_ambiguity
-from slatprep.judge.verdict import (
-    THRESHOLDS,
-    contradicted,
-    judge,
-    merged,
-    verdict_of,
-    voxel_confidence,
-)
-
-__all__ = [
-    "THRESHOLDS",
-    "contradicted",
-    "judge",
-    "measure_ambiguity",
-    "merged",
-    "verdict_of",
-    "voxel_confidence",
-]
+from slatprep.judge.ambiguity import measure_ambiguity as measure_ambiguity
+from slatprep.judge.verdict import THRESHOLDS as THRESHOLDS
+from slatprep.judge.verdict import contradicted as contradicted
+from slatprep.judge.verdict import judge as judge
+from slatprep.judge.verdict import merged as merged
+from slatprep.judge.verdict import verdict_of as verdict_of
+from slatprep.judge.verdict import voxel_confidence as voxel_confidence

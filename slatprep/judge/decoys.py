@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, minimize
 from scipy.special import expit, logit
 
+from slatprep.geometry.frames import Array
 from slatprep.judge.calibration import SAME_OBJECT
 from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 
-Array = NDArray[np.float64]
 Range = tuple[float, float]
 
 FOLDS, ROUNDS = 3, 3

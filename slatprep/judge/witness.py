@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, expit, logsumexp, softmax
 
-from slatprep.geometry.frames import places_of
+from slatprep.geometry.frames import Array, places_of
 from slatprep.judge.evidence import HARMLESS
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
@@ -63,8 +63,6 @@ REACH = 6.0
 
 _SHRINK = 1.0  # assets' worth of the mean of all latents in the mean of each class
 _RIDGE = 1e-3  # of a channel's usual variance
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -145,16 +145,15 @@ class Run:
             (self.path / _LOCK).unlink(missing_ok=True)
         os.close(self._lock)
 
-    def begin(self, parameters: dict[str, Any], assignment: Assignment | None = None) -> None:
+    def begin(self, parameters: dict[str, Any], assignment: Assignment) -> None:
         """Write the parameters of a new run, or continue a run with the same parameters.
 
         The result must depend on nothing else. The objects of each split go into ``splits.json``,
         their digest into ``run.json``. ConfigError if the run in the folder has other parameters;
         the message names them.
         """
-        if assignment is not None:
-            lists = json.dumps(assignment.lists(), indent=1) + "\n"
-            parameters = parameters | {"splits": hashlib.sha256(lists.encode()).hexdigest()}
+        lists = json.dumps(assignment.lists(), indent=1) + "\n"
+        parameters = parameters | {"splits": hashlib.sha256(lists.encode()).hexdigest()}
         text = json.dumps(parameters, indent=1, sort_keys=True) + "\n"
         wanted, found = json.loads(text), self.parameters
         file = self.path / RUN_FILE
@@ -171,9 +170,8 @@ class Run:
                 f"{file}: the run there has other parameters ({', '.join(others)}); "
                 "repeat them to go on with it, or choose another --out"
             )
-        if assignment is not None:
-            with staged(self.path / SPLITS_FILE) as path:
-                path.write_text(lists, encoding="utf-8")
+        with staged(self.path / SPLITS_FILE) as path:
+            path.write_text(lists, encoding="utf-8")
 
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; an existing one is replaced when the new one is complete."""

@@ -22,7 +22,7 @@ from slatprep.learn.decoder import Prediction, make_decoder
 from slatprep.learn.metrics import fit_baselines
 from slatprep.learn.runs import BEST, LAST, Run
 from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
-from slatprep.readers.splits import Shares, split_of
+from slatprep.readers.splits import Assignment, Shares, split_of
 from slatprep.storage.atomic import take_lock
 
 SHARES = Shares(0.4, 0.3, 0.3)
@@ -290,7 +290,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(tmp_path, monkeypatch):
 
     monkeypatch.setattr("slatprep.learn.runs.take_lock", late)
     with Run(tmp_path / "run") as run:  # What another wrote before the lock was ours is read.
-        assert run.parameters == {"seed": 7}
+        assert run.parameters.keys() == {"seed", "splits"}
     assert not (tmp_path / "run/.lock").exists()
 
 
@@ -301,13 +301,13 @@ def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(tmp_path, monkeyp
     with monkeypatch.context() as patched, Run(tmp_path / "run") as run:
         patched.setattr("slatprep.storage.atomic.flush", full)
         with pytest.raises(OSError, match="No space left"):
-            run.begin({"seed": 7})
+            run.begin({"seed": 7}, Assignment({}))
         assert not (tmp_path / "run/run.json").exists()
     (tmp_path / "run/.run.json.partial").write_text("{")  # As a killed training leaves it.
     with Run(tmp_path / "run") as run:
-        run.begin({"seed": 7})
+        run.begin({"seed": 7}, Assignment({}))
     with Run(tmp_path / "run") as run:
-        assert run.parameters == {"seed": 7}
+        assert run.parameters.keys() == {"seed", "splits"}
 
 
 @pytest.mark.parametrize(
