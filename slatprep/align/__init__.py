@@ -64,15 +64,7 @@ def align(
 def require_engine(parameters: AlignParameters) -> None:
     """Make sure that an engine's package is installed, and Open3D can be loaded.
 
-    Parameters
-    ----------
-    parameters : AlignParameters
-        Which engine.
-
-    Raises
-    ------
-    ConfigError
-        If it is not; the message says what to install.
+    ConfigError if it is not; the message says what to install.
     """
     extra = _EXTRAS.get(parameters.engine)
     if extra is not None and find_spec(parameters.engine) is None:
@@ -87,22 +79,9 @@ def require_engine(parameters: AlignParameters) -> None:
 
 
 def engine_versions(parameters: AlignParameters) -> dict[str, str]:
-    """Return the versions of the libraries that make an engine's numbers.
+    """Return the versions, by package, of the libraries that make an engine's numbers.
 
-    Parameters
-    ----------
-    parameters : AlignParameters
-        Which engine.
-
-    Returns
-    -------
-    dict of str to str
-        Package and version.
-
-    Raises
-    ------
-    ConfigError
-        If the engine is not installed.
+    ConfigError if the engine is not installed.
     """
     require_engine(parameters)
     versions = {}

@@ -37,8 +37,7 @@ class Similarity(NamedTuple):
 
     def inverse(self, points: Array) -> Array:
         """Return where points (N, 3) of the SLAT frame lie in the PixieVerse frame, in voxels."""
-        places: Array = (points - self.shift) @ self.rotation / self.scale
-        return places
+        return (points - self.shift) @ self.rotation / self.scale
 
 
 class Poses(NamedTuple):
@@ -56,9 +55,9 @@ class Poses(NamedTuple):
 
     def similarities(self) -> list[Similarity]:
         """Return them one by one."""
-        numbers = zip(self.scales.tolist(), self.offsets.tolist(), strict=True)
-        arrays = zip(self.rotations, self.shifts, strict=True)
-        return [Similarity(*pair, *rest) for pair, rest in zip(arrays, numbers, strict=True)]
+        numbers = self.scales.tolist(), self.offsets.tolist()
+        each = zip(self.rotations, self.shifts, *numbers, strict=True)
+        return [Similarity(*one) for one in each]
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,8 +81,7 @@ class Residuals:
 
     def kernels(self, warp: Warp) -> Array:
         """Return 1 / (1 + r^2) of each sample."""
-        kernels: Array = 1.0 / (1.0 + np.concatenate(self.at(warp)) ** 2)
-        return kernels
+        return 1.0 / (1.0 + np.concatenate(self.at(warp)) ** 2)
 
     def fit_affine(self, warp: Warp, taus: Sequence[float], seen: NDArray[np.intp]) -> Warp:
         """Improve the affine part by one step for each of `taus`, on the samples `seen`."""

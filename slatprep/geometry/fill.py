@@ -30,8 +30,7 @@ def outside_of(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     free = ~np.packbits(lines.reshape(-1), bitorder="little").view("<u8").astype(np.uint64)
     flooded = _flood(free.reshape(a, b), np.uint64(1 | 1 << (c - 1))).astype("<u8")
     bits = np.unpackbits(flooded.view(np.uint8).reshape(-1), bitorder="little")
-    outside: NDArray[np.bool_] = bits.view(np.bool_).reshape(a, b, WORD)[..., :c]
-    return outside
+    return bits.view(np.bool_).reshape(a, b, WORD)[..., :c]
 
 
 @kernel()

@@ -47,7 +47,8 @@ class Lattice:
         Points may lie outside the cube. The first of several equally near voxels counts. The
         distance is infinite, and the row -1, where it exceeds `limit` (voxels).
         """
-        position = _in_voxels(points)
+        # In index units, where voxel i is centred at i.
+        position = np.ascontiguousarray((np.asarray(points, np.float64) + 0.5) * RESOLUTION - 0.5)
         near = self._blocks_near(min(limit, _SURE))
         distance, nearest = _search(position, self._row, near, *_cells(), float(limit) ** 2)
         if limit >= _SURE:
@@ -97,11 +98,6 @@ class Lattice:
         alike = self._alike[1]
         _vote(points, near, self._row, labels, alike, parties, steepness, distance, nearest)
         return distance, nearest, near
-
-
-def _in_voxels(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions in index units, where voxel i is centred at i."""
-    return np.ascontiguousarray((np.asarray(points, dtype=np.float64) + 0.5) * RESOLUTION - 0.5)
 
 
 @lru_cache(maxsize=1)

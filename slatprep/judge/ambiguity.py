@@ -35,26 +35,11 @@ def measure_ambiguity(
 ) -> Ambiguity:
     """Measure how the labels change between placements that fit about equally well.
 
-    Of more than `MOST_VOXELS` voxels at most a fourth of that is looked at, evenly chosen.
-
-    Parameters
-    ----------
-    field, latents : MaterialField, StructuredLatents
-        The two sides of the asset.
-    alignment : Alignment
-        Its alignment; ``placements`` are the ones that tie with the best.
-    annotation : Annotation
-        What was looked up under its transform.
-    parameters : SampleParameters
-        How annotations are looked up.
-
-    Returns
-    -------
-    Ambiguity
-        The share of SLAT voxels whose class differs in any of the placements
-        (where there are no classes, a property by more than `NOTABLE`),
-        and the largest mean absolute change of each property, of log10 where it
-        is normalised so, over the voxels valid in both.
+    `annotation` is what was looked up under the alignment's transform; its ``placements`` tie with
+    it. The share is of SLAT voxels whose class differs in any of them; without classes, a property
+    by more than `NOTABLE`. The change of a property is the largest mean absolute one, of log10 where
+    it is normalised so, over the voxels valid in both. Of more than `MOST_VOXELS` voxels at most a
+    fourth of that is looked at, evenly chosen.
     """
     times = thinning(len(latents.coords))
     # An odd step: an even one would, of a grid in order, take some layers alone.

@@ -158,8 +158,7 @@ def _wrong_share(
 
 def _surpassed(scores: Array, by: Array) -> NDArray[np.intp]:
     """Return how many of `by` reach each score."""
-    found: NDArray[np.intp] = len(by) - np.searchsorted(np.sort(by), scores, side="left")
-    return found
+    return len(by) - np.searchsorted(np.sort(by), scores, side="left")
 
 
 def _rates(scores: Array, decoy_scores: Array, share: float) -> Array:

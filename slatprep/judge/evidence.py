@@ -13,7 +13,6 @@ from slatprep.judge.ambiguity import NOTABLE, thinning
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import (
     UNANNOTATED,
-    Agreement,
     Alignment,
     Annotation,
     MaterialField,
@@ -21,41 +20,16 @@ from slatprep.records import (
 )
 
 FIGURES = (
-    "score_slat",
-    "score_pixieverse",
-    "score_similarity",
-    "within_1",
-    "within_2",
-    "within_3",
-    "moved",
-    "moved_most",
-    "bending",
-    "stretch",
-    "scale",
-    "offset",
-    "margin",
-    "clear_by",
-    "ties",
-    "fitness",
-    "fitness_backward",
-    "valid_share",
-    "distance",
-    "depth",
-    "alike",
-    "ground",
-    "directions_near",
-    "directions_middle",
-    "directions_worst",
-    "blocks_near",
-    "blocks_middle",
-    "blocks_far",
-    "slat_within_half",
-    "slat_within_1",
-    "slat_within_15",
-    "pixieverse_within_half",
-    "pixieverse_within_1",
-    "pixieverse_within_15",
-)
+    "score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
+    "moved", "moved_most", "bending", "stretch", "scale", "offset",
+    "margin", "clear_by", "ties",
+    "fitness", "fitness_backward",
+    "valid_share", "distance", "depth", "alike", "ground",
+    "directions_near", "directions_middle", "directions_worst",
+    "blocks_near", "blocks_middle", "blocks_far",
+    "slat_within_half", "slat_within_1", "slat_within_15",
+    "pixieverse_within_half", "pixieverse_within_1", "pixieverse_within_15",
+)  # fmt: skip
 """The figures of an alignment, in the order of `evidence_of`."""
 
 RADII = (1, 2, 4, 7)
@@ -111,8 +85,7 @@ class Surroundings:
     @property
     def depth(self) -> NDArray[np.float32]:
         """Share of annotated cells two voxels away, less the half that a surface has."""
-        depth: NDArray[np.float32] = self.solid[:, 1] - np.float32(0.5)
-        return depth
+        return self.solid[:, 1] - np.float32(0.5)
 
     def where(self, chosen: NDArray[np.bool_]) -> Surroundings:
         """Return what lies around the chosen ones (N,) of the places."""
@@ -231,6 +204,9 @@ def evidence_of(
     if (count and ambiguity <= HARMLESS) or alignment.settled_by is not None:
         count, margin, clear_by = 0, math.nan, math.nan
     _, _, scale = split_transform(alignment.transform)
+    agreement = np.full(len(FIGURES) - FIGURES.index("directions_near"), np.nan)
+    if fit.agreement is not None:
+        agreement = np.hstack(astuple(fit.agreement))
     return np.array(
         [
             fit.score_slat,
@@ -253,12 +229,7 @@ def evidence_of(
             around.depth.std(),
             float(math.isnan(margin)),
             float(alignment.ground is not None),
-            *_agreement(fit.agreement),
+            *agreement,
         ],
         dtype=np.float64,
     )
-
-
-def _agreement(agreement: Agreement | None) -> NDArray[np.float64]:
-    figures = FIGURES[FIGURES.index("directions_near") :]
-    return np.full(len(figures), np.nan) if agreement is None else np.hstack(astuple(agreement))

@@ -142,18 +142,9 @@ def _doubted(judgement: Judgement, reason: str) -> Judgement:
 def merged(judgement: Judgement, annotation: Annotation) -> Judgement:
     """Return what several annotations are worth together.
 
-    Parameters
-    ----------
-    judgement : Judgement
-        Of the first of them, by its own labels.
-    annotation : Annotation
-        What `slatprep.sample.merge` made of all.
-
-    Returns
-    -------
-    Judgement
-        With the share of right labels that can be expected of the merged ones; doubtful
-        where that is too low because they differ.
+    The judgement is of the first of them, by its own labels, the annotation what
+    `slatprep.sample.merge` made of all. Where fewer labels can be expected to be right because the
+    annotations differ, the asset is doubtful.
     """
     valid = annotation.valid
     likely = np.zeros(1) if annotation.confidence is None else annotation.confidence[valid]
@@ -176,19 +167,10 @@ def voxel_confidence(
     annotation: Annotation,
     confidence: float,
 ) -> NDArray[np.float32]:
-    """Say how likely the class of each SLAT voxel is right.
+    """Say how likely the class of each SLAT voxel (N,) is right; 0 where not valid.
 
-    Parameters
-    ----------
-    field, latents, alignment, annotation
-        As `judge` takes them.
-    confidence : float
-        What `judge` says of the placement.
-
-    Returns
-    -------
-    ndarray of float32, shape (N,)
-        Calibrated for the mix of data that docs/quality.md names; 0 where not valid.
+    All is as `judge` takes it; `confidence` is what that says of the placement. Calibrated for the
+    mix of data that docs/quality.md names.
     """
     from slatprep.judge.confidence import class_confidence
     from slatprep.judge.evidence import surroundings_of
@@ -200,24 +182,11 @@ def voxel_confidence(
 def verdict_of(
     alignment: Alignment, judgement: Judgement, valid_share: float
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """Say what an alignment is worth, and why.
+    """Say what an alignment is worth, and why it is not better.
 
-    Parameters
-    ----------
-    alignment : Alignment
-        How well the two surfaces lie on each other, what ties, and what mirroring would gain.
-    judgement : Judgement
-        Its figures; verdict and reasons are not looked at. Where its probabilities are NaN, the
-        fitness decides.
-    valid_share : float
-        Share of SLAT voxels that got an annotation, 0..1.
-
-    Returns
-    -------
-    verdict : Verdict
-        ``good``, ``doubtful`` or ``failed``.
-    reasons : tuple of str
-        What kept it from being good; empty where it is.
+    The fit is the alignment's, all else the `judgement`'s, whose verdict and reasons are not looked
+    at. Where its probabilities are NaN the fitness decides. `valid_share` is the share of SLAT
+    voxels that got an annotation.
     """
     limits, quality = THRESHOLDS, alignment.quality
     same_object, right_placement = judgement.same_object, judgement.right_placement

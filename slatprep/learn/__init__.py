@@ -28,17 +28,9 @@ def __getattr__(name: str) -> object:
 
 
 def require_torch(device: str = "cpu") -> None:
-    """Make sure that PyTorch is installed and finds the device.
+    """Make sure that PyTorch is installed and finds the device, ``cpu`` or ``cuda``.
 
-    Parameters
-    ----------
-    device : str
-        ``cpu`` or ``cuda``.
-
-    Raises
-    ------
-    ConfigError
-        If PyTorch cannot be imported, with the command that installs it, or finds no ``cuda``.
+    ConfigError if it cannot be imported, with the command that installs it, or finds no ``cuda``.
     """
     with needing("decoders need", "train"):
         import torch

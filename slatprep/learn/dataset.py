@@ -208,18 +208,7 @@ class SlatDataset(Dataset[Item]):
 
 
 def collate(items: Sequence[Item]) -> SparseBatch:
-    """Make one sparse batch of several assets.
-
-    Parameters
-    ----------
-    items : sequence of Item
-        At least one.
-
-    Returns
-    -------
-    SparseBatch
-        The assets in this order.
-    """
+    """Make one sparse batch of at least one asset, in the given order."""
     coords = [
         torch.nn.functional.pad(item.coords, (1, 0), value=number)
         for number, item in enumerate(items)
@@ -229,16 +218,9 @@ def collate(items: Sequence[Item]) -> SparseBatch:
 
 
 class EpochSampler(Sampler[Draw]):
-    """Each asset once, in an order that follows from seed and epoch.
+    """Each of `length` assets once, in an order that follows from seed and epoch.
 
-    Parameters
-    ----------
-    length : int
-        Number of assets.
-    shuffle : bool
-        Whether to shuffle the assets, or keep the order of the store.
-    seed : int
-        With the epoch, decides the order.
+    Without `shuffle` the order is that of the store.
     """
 
     def __init__(self, length: int, *, shuffle: bool, seed: int) -> None:

@@ -259,7 +259,8 @@ def fit_baselines(store: Store, assets: Iterable[int]) -> tuple[VoxelBaseline, V
     for index in assets:
         rows = store.read(index, COLUMNS)
         valid = rows["valid"]
-        inputs, targets = _inputs(rows)[valid], _targets(rows, contents.n_classes)[valid]
+        classes = rows["material"][:, None] == np.arange(contents.n_classes)
+        inputs, targets = _inputs(rows)[valid], np.hstack([rows["properties"], classes])[valid]
         squares += inputs.T @ inputs
         products += inputs.T @ targets
     # The last input is 1, so its products are the sum of the targets and the count.
@@ -276,7 +277,3 @@ def _inputs(rows: Rows) -> NDArray[np.float64]:
     # Of another grid than 64^3 on another scale, which the weights make up for.
     position = voxel_centres(rows["coords"])
     return np.hstack([rows["feats"], position, np.ones((len(position), 1))])
-
-
-def _targets(rows: Rows, classes: int) -> NDArray[np.float64]:
-    return np.hstack([rows["properties"], rows["material"][:, None] == np.arange(classes)])

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, require_one_of
+from slatprep.errors import require_one_of
 from slatprep.readers.splits import HASH, SPLITS, Assignment, Split, assign_splits
 from slatprep.readers.splits import Shares as Shares
 from slatprep.readers.splits import split_of as split_of
@@ -46,8 +46,8 @@ def select_assets(
     Assets without a valid voxel are out, too: they have no labels. `splits` gives the split of each
     object by id, by default the split by hash. ConfigError if split or verdict is unknown.
     """
-    if split is not None and split not in SPLITS:
-        raise ConfigError(f"there is no split {split!r}; expected one of {', '.join(SPLITS)}")
+    if split is not None:
+        require_one_of("split", split, SPLITS)
     chosen = store.column("valid_share") > 0
     if verdicts is not None:
         verdicts = words_of(verdicts)
