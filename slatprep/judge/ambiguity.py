@@ -37,9 +37,9 @@ def measure_ambiguity(
 
     `annotation` is what was looked up under the alignment's transform; its ``placements`` tie with
     it. The share is of SLAT voxels whose class differs in any of them; without classes, a property
-    by more than `NOTABLE`. The change of a property is the largest mean absolute one, of log10 where
-    it is normalised so, over the voxels valid in both. Of more than `MOST_VOXELS` voxels at most a
-    fourth of that is looked at, evenly chosen.
+    by more than `NOTABLE`. The change of a property is the largest mean absolute one, of log10
+    where it is normalised so, over the voxels valid in both. Of more than `MOST_VOXELS` voxels at
+    most a fourth of that is looked at, evenly chosen.
     """
     times = thinning(len(latents.coords))
     # An odd step: an even one would, of a grid in order, take some layers alone.
