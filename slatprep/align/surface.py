@@ -146,9 +146,10 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
     near, values = near_surface(distance, BAND)
     # Half a voxel deep are just those that touch an empty voxel by a face.
     boundary = near.take(np.flatnonzero(values == -0.5), axis=0)
-    boundary += np.array([side.start - _MARGIN for side in box]).astype(np.uint8)
+    corner = np.array([side.start - _MARGIN for side in box])
+    boundary += corner.astype(np.uint8)
     distance += np.float32(DILATION)
-    origin = np.array([side.start for side in box], dtype=np.float64) - _MARGIN - CENTRE
+    origin = corner - CENTRE
     return Surface(
         distance=distance,
         origin=origin,

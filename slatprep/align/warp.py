@@ -43,15 +43,11 @@ class Warp(NamedTuple):
         """Return it bounded, not folded and rounded; `points` (N, 3) are the SLAT's."""
         affine = self.affine.copy()
         affine[:, 3] *= VOXEL_SIZE
-        bent = bool(self.coefficients.any())
-        return make_deformation(
-            affine,
-            self.origin * VOXEL_SIZE if bent else np.zeros(3),
-            self.spacing * VOXEL_SIZE if bent else 1.0,
-            self.coefficients * VOXEL_SIZE if bent else np.zeros((0, 0, 0, 3)),
-            points * VOXEL_SIZE,
-            max_displacement,
-        )
+        lattice: tuple[Array, float, Array] = np.zeros(3), 1.0, np.zeros((0, 0, 0, 3))
+        if self.coefficients.any():
+            origin, spacing, coefficients = self.origin, self.spacing, self.coefficients
+            lattice = origin * VOXEL_SIZE, spacing * VOXEL_SIZE, coefficients * VOXEL_SIZE
+        return make_deformation(affine, *lattice, points * VOXEL_SIZE, max_displacement)
 
 
 def halved(warp: Warp) -> Warp:

@@ -19,6 +19,7 @@ from torch.nn import functional
 from slatprep.records import MAX_LATENT_RESOLUTION, PIXIEVERSE, Contents
 
 WINDOW = 8
+"""Edge of an attention window [voxel]."""
 
 _BUCKETS = (8, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 """Bounds on the voxels of windows that share one padded attention call; most is 8^3."""
@@ -172,15 +173,13 @@ class SwinBlock(nn.Module):
 class PhysicsDecoder(nn.Module):
     """A decoder from latents to the physical properties and the class of every voxel.
 
-    `size` is one of `SIZES` or another, `window` the edge of an attention window [voxel]. The
-    latents, properties and classes of `contents` give the widths of input and heads.
+    `size` is one of `SIZES` or another. The latents, properties and classes of `contents` give the
+    widths of input and heads.
     """
 
-    def __init__(
-        self, size: DecoderSize, window: int = WINDOW, contents: Contents = PIXIEVERSE
-    ) -> None:
+    def __init__(self, size: DecoderSize, contents: Contents = PIXIEVERSE) -> None:
         super().__init__()
-        self.size, self.window = size, window
+        self.size = size
         self.embed = nn.Linear(contents.latents.channels, size.channels)
         self.blocks = nn.ModuleList(
             SwinBlock(size.channels, size.heads) for _ in range(size.blocks)
@@ -201,8 +200,7 @@ class PhysicsDecoder(nn.Module):
 
         Rows may be in any order.
         """
-        shifts = (0, self.window // 2)
-        windows = [partition(coords, self.window, shift) for shift in shifts]
+        windows = [partition(coords, WINDOW, shift) for shift in (0, WINDOW // 2)]
         hidden = self.embed(feats) + embed_position(coords[:, 1:], self.size.channels)
         for number, block in enumerate(self.blocks):
             hidden = block(hidden, windows[number % 2])
