@@ -21,8 +21,8 @@ from slatprep.records import MAX_LATENT_RESOLUTION, PIXIEVERSE, Contents
 WINDOW = 8
 """Edge of an attention window [voxel]."""
 
-_BUCKETS = (8, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512)
-"""Bounds on the voxels of windows that share one padded attention call; most is 8^3."""
+_BUCKETS = (8, 16, 32, 48, 64, 96, 128, 192, 256, 384, WINDOW**3)
+"""Bounds on the voxels of windows that share one padded attention call."""
 
 
 @dataclass(frozen=True)
@@ -75,19 +75,19 @@ class Windows(NamedTuple):
     back: Tensor
 
 
-def partition(coords: Tensor, window: int, shift: int) -> Windows:
+def partition(coords: Tensor, shift: int) -> Windows:
     """Group voxels (N, 4), batch column first and in any order, by window.
 
-    Windows have edges of `window` voxels, and their grid is shifted by `shift` voxels.
+    The windows' grid is shifted by `shift` voxels.
     """
-    cell = torch.div(coords[:, 1:].long() + shift, window, rounding_mode="floor")
-    across = (MAX_LATENT_RESOLUTION + window) // window + 1
+    cell = torch.div(coords[:, 1:].long() + shift, WINDOW, rounding_mode="floor")
+    across = (MAX_LATENT_RESOLUTION + WINDOW) // WINDOW + 1
     key = ((coords[:, 0].long() * across + cell[:, 0]) * across + cell[:, 1]) * across + cell[:, 2]
     order = torch.argsort(key, stable=True)
     counts = torch.unique_consecutive(key[order], return_counts=True)[1]
     starts = torch.cumsum(counts, 0) - counts
     rows, masks, smallest = [], [], 0
-    for limit in [*(size for size in _BUCKETS if size < window**3), window**3]:
+    for limit in _BUCKETS:
         chosen = (counts > smallest) & (counts <= limit)
         smallest = limit
         if bool(chosen.any()):
@@ -200,7 +200,7 @@ class PhysicsDecoder(nn.Module):
 
         Rows may be in any order.
         """
-        windows = [partition(coords, WINDOW, shift) for shift in (0, WINDOW // 2)]
+        windows = [partition(coords, shift) for shift in (0, WINDOW // 2)]
         hidden = self.embed(feats) + embed_position(coords[:, 1:], self.size.channels)
         for number, block in enumerate(self.blocks):
             hidden = block(hidden, windows[number % 2])

@@ -242,7 +242,7 @@ def test_attention_equals_a_dense_reference(shift):
     coords, _ = voxels(300, 3, extent=24)
     coords[150:, 0] = 1
     hidden = torch.randn(300, 24)
-    sparse = attention(hidden, partition(coords, 8, shift))
+    sparse = attention(hidden, partition(coords, shift))
     # Every pair, then a softmax over those that share batch and window.
     place = [(int(b), *((int(i) + shift) // 8 for i in voxel)) for b, *voxel in coords]
     same = torch.tensor([[a == b for b in place] for a in place])
