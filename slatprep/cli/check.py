@@ -21,15 +21,9 @@ if TYPE_CHECKING:
     from slatprep.records import Place
     from slatprep.store import Store
 
-_COLUMNS = {
-    "confidence": "confidence",
-    "labels": "expected_accuracy",
-    "fitness": "fitness",
-    "back": "fitness_backward",
-    "valid": "valid_share",
-    "tied": "ambiguity",
-}
-"""Figures by their short titles; a line has room for six."""
+_FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "valid_share",
+            "ambiguity")  # fmt: skip
+"""A line has room for six."""
 
 
 @command("check-alignment")
@@ -145,14 +139,11 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
     if not checks:
         say("no asset is ambiguous")
     if len(checks) > 1:
-        length, names = output.id_length(one.asset_id for one in checks), _COLUMNS.values()
+        length = output.id_length(one.asset_id for one in checks)
         output.table(
             "Alignments",
-            ("asset", "verdict", *_COLUMNS, "as stored"),
-            [
-                (one.asset_id[:length], one.verdict, *map(one.value, names), one.consistent)
-                for one in checks
-            ],
+            ("asset", "verdict", *_FIGURES),
+            [(one.asset_id[:length], one.verdict, *map(one.value, _FIGURES)) for one in checks],
         )
     for one in checks:
         if len(checks) == 1 or output.verbosity > 0:

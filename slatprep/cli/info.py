@@ -38,7 +38,7 @@ def info(output: Output, store: options.LastStore) -> None:
         contents: dict[str, Cell] = {
             "assets": overview.total.assets,
             "voxels": overview.total.voxels,
-            "valid": overview.total.valid_share,
+            "valid_share": overview.total.valid_share,
             "unphysical": overview.total.unphysical,
             "files": overview.files,
             "MB": overview.size / 1e6,
@@ -62,23 +62,19 @@ def info(output: Output, store: options.LastStore) -> None:
 
 
 def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True) -> None:
-    """Print how good the alignments of a store are, by category and in all.
-
-    ``labels`` is the expected share of right classes. Lines below the table say which
-    assets to look at, and how.
-    """
+    """Print how good the alignments of a store are, which assets to look at, and how."""
     from slatprep.inspect.overview import UNKNOWN
     from slatprep.judge import THRESHOLDS
     from slatprep.storage.versions import is_version
 
-    medians = attrgetter("confidence", "expected_accuracy", "fitness", "valid_share")
+    figures = ("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
     categories = [(apart_from(one.name, (total.name,)), one) for one in overview.categories]
     output.table(
         "Alignments (medians)",
-        ("category", *total.verdicts, "confidence", "labels", "fitness", "valid"),
+        ("category", *total.verdicts, *figures),
         [
-            (name, *group.verdicts.values(), *medians(group))
+            (name, *group.verdicts.values(), *attrgetter(*figures)(group))
             for name, group in (*categories, (total.name, total))
         ],
     )
@@ -94,7 +90,7 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
         say(f"why:     slatprep list {store} {options}")
     if total.ambiguous:
         say(
-            f"tied:    {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
+            f"ambiguous: {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
             f"well, and change more than {THRESHOLDS.good_ambiguity:.0%} of the classes"
         )
         say(f"look:    slatprep check-alignment --ambiguous --store {store}")

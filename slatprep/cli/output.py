@@ -282,11 +282,13 @@ def _rich_table(
     table = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, show_edge=False)
     needed = 0
     for k, (column, right) in enumerate(zip(columns, numeric, strict=True)):
-        fits, widest = column not in _MAY_SHRINK, max(len(row[k]) for row in [columns, *cells])
+        heading = column.replace("_", "_\n")  # The name of a figure may be wider than its numbers.
+        widest = max(map(len, [*heading.split("\n"), *(row[k] for row in cells)]))
+        fits = column not in _MAY_SHRINK
         least = widest if fits else min(widest, _LEAST_WIDTH)
         needed += least + _GAP
         table.add_column(
-            Text(column),
+            Text(heading),
             justify="right" if right else "left",
             no_wrap=fits,
             min_width=least,

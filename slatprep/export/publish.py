@@ -173,9 +173,9 @@ def card_of(
         *(f"![Some of the assets, aligned, and the error of each voxel]({n})" for n in pictures),
         "## What is in it",
         "\n".join(_table(store, kept)),
-        "`good`, `doubtful` and `failed` are verdicts on the alignment; `labels_right` is the "
-        "share of material classes that can be expected to be right, `valid` that of the voxels "
-        "with an annotation. Confidence and `labels_right` are medians over assets.",
+        "`good`, `doubtful` and `failed` are verdicts on the alignment; `expected_accuracy` is the "
+        "share of material classes that can be expected to be right, `valid_share` that of the "
+        "voxels with an annotation. `confidence` and `expected_accuracy` are medians over assets.",
         "## How to read it",
         how,
         "`sha256sum --check SHA256SUMS` checks the files.",
@@ -199,7 +199,7 @@ def _table(store: Store, kept: NDArray[np.bool_]) -> Iterator[str]:
         for name in ("category", "verdict", "confidence", "expected_accuracy", "valid_share")
     }
     columns["voxels"] = np.diff(store.offsets)[kept]
-    figures = "good | doubtful | failed | confidence | labels_right | valid"
+    figures = "good | doubtful | failed | confidence | expected_accuracy | valid_share"
     yield f"| category | assets | voxels | {figures} |"
     yield "| --- |" + " ---: |" * 8
     names = sorted(set(map(str, columns["category"])))

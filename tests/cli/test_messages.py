@@ -202,7 +202,7 @@ def test_ambiguous_means_the_same_wherever_it_is_counted(store, tmp_path):
     copied = tmp_path / "copy.zarr"
     run("subset", store, "--verdict", "good", "--out", copied, "-q")
     zarr.open_group(copied, mode="r+")["asset/ambiguity"][:] = [0.0, 0.2, 0.9, 0.05, 0.01]
-    assert "2 of 5: other placements" in run("info", copied).stdout
+    assert "\nambiguous: 2 of 5: other placements" in run("info", copied).stdout
     drawn = document("check-alignment", "--store", copied, "--ambiguous", "--picture", "none")
     assert [one["asset_id"] for one in drawn["assets"]] == ["bear.side", "bear.front"]
 

@@ -179,7 +179,7 @@ def test_asset_ids_complete_from_the_store(mixed_build, monkeypatch):
     assert complete("slatprep export no.zarr --asset b").strip() == ""
 
 
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("manifests/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("definitions/*.md")])
 
 
 def code_lines(language: str) -> list[tuple[str, str]]:
@@ -262,7 +262,7 @@ def test_formats_describes_every_array():
 
 @pytest.mark.parametrize("name", ["demo.toml", "mine.example.toml"])
 def test_example_definitions_are_valid(name, tmp_path):
-    text = (ROOT / "manifests" / name).read_text("utf-8")
+    text = (ROOT / "definitions" / name).read_text("utf-8")
     # Every example key that is commented out counts as well.
     full = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.M)
     for variant in (text, full):

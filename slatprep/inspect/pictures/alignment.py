@@ -56,19 +56,9 @@ COLUMNS = {
 _SIDE_WIDTH, _SIDE_MARGIN = 402, 48
 """Width of the column, and of the margin at its right, in pixels."""
 
-_SHOWN = {
-    "confidence": "confidence",
-    "expected_accuracy": "labels expected right",
-    "fitness": "fitness, PixieVerse to SLAT",
-    "inlier_rmse": "inlier rmse [voxel]",
-    "fitness_backward": "fitness, SLAT to PixieVerse",
-    "inlier_rmse_backward": "inlier rmse [voxel]",
-    "overlap": "overlap",
-    "valid_share": "valid share",
-    "ambiguity": "class ambiguous",
-    "margin": "margin",
-}
-"""The figures of a check on a picture: their names in the store, and what the picture says."""
+_SHOWN = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
+          "inlier_rmse_backward", "overlap", "valid_share", "ambiguity", "margin")  # fmt: skip
+"""The figures of a check on a picture."""
 
 _LINE = 21
 
@@ -222,7 +212,7 @@ def _scale(figure: Figure, farthest: float, x: int, y: int) -> None:
 
 def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y: float) -> float:
     """Write figures, thresholds and the size of the map; return the height of the last line."""
-    columns = (left, left + 275, left + _SIDE_WIDTH)
+    columns = (left, left + 312, left + _SIDE_WIDTH)
     for x, name in zip(columns, ("figure", "value", "good"), strict=True):
         canvas.note(figure, x, y, name, 6.8, ha="left" if x == left else "right")
     canvas.draw_line(figure, left, y + 7, (left + _SIDE_WIDTH, y + 7), canvas.RULE)
@@ -231,7 +221,8 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y
         line = y + 30 + _LINE * number
         worse = one.passes is False
         colour = canvas.VERDICT_COLOURS["failed"] if worse else canvas.INK
-        canvas.write(figure, columns[0], line, _SHOWN[one.name], size=7.5)
+        unit = " [voxel]" if one.name.startswith("inlier_rmse") else ""
+        canvas.write(figure, columns[0], line, f"{one.name}{unit}", size=7.5)
         # Adding 0 turns a rounded -0 into 0.
         value = "-" if np.isnan(one.value) else f"{round(one.value, 3) + 0.0:.3f}"
         canvas.write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
@@ -299,7 +290,8 @@ def _candidates(figure: Figure, alignment: Alignment, left: float, y: float) -> 
     axes.set_yticks([0, 0.5, 1])
     best = own[0]
     if wide:
-        name = "these fit poorly: all orientations were searched"
+        name = "quarter turns fit poorly, so all orientations"
+        name += "\nwere searched: look whether the result fits"
         axes.set_xticks([-0.4], [name], ha="left")
     elif best.euler_degrees is not None:
         name = "start at " + ", ".join(f"{angle:g}°" for angle in best.euler_degrees)

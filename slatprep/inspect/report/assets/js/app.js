@@ -156,13 +156,13 @@ const Detail = (() => {
     const rows = [0, 4, 8].map((k) => matrix.slice(k, k + 4).map((x) => x.toFixed(4).replace("-", "−").padStart(8)).join(" "));
     const list = [
       ["Confidence", fixed(value("confidence"))],
-      ["Labels expected right", Format.share(value("expected_accuracy"))],
+      ["Expected accuracy", Format.share(value("expected_accuracy"))],
       ["Fitness", fixed(value("fitness"))],
-      ["Fitness, SLAT to PixieVerse", fixed(value("fitness_backward"))],
+      ["Fitness backward", fixed(value("fitness_backward"))],
       ["Inlier rmse", `${fixed(value("inlier_rmse"))} voxel`],
       ["Overlap", fixed(value("overlap"))],
       ["Valid share", Format.share(value("valid_share"), 2)],
-      ["Class ambiguous", Format.share(value("ambiguity"))],
+      ["Ambiguity", Format.share(value("ambiguity"))],
       ["Tied placements", value("tied") === null ? Format.NONE : Format.count(value("tied"))],
       ["Displacement between them", value("displacement") === null ? Format.NONE : `${value("displacement").toFixed(1)} voxel`],
       ["Margin", fixed(value("margin"))],

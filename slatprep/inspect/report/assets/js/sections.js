@@ -23,7 +23,7 @@ const Sections = (() => {
     ];
     const unphysical = sum(known(ASSETS.unphysical));
     if (unphysical) tiles.push(["unphysical voxels left out", Format.count(unphysical)]);
-    tiles.push(["tied, with other labels", Format.count(ambiguous)]);
+    tiles.push(["ambiguous", Format.count(ambiguous)]);
     const merged = known(ASSETS.spreads).length;
     if (merged) tiles.push(["assets with merged labels", Format.count(merged)]);
     byId("tiles").replaceChildren(...tiles.map(([name, value]) => el("div", {}, el("dt", {}, name), el("dd", {}, value))));
