@@ -8,7 +8,6 @@ difference of shapes continues from block to block; a field's roughness does not
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import Surface
 from slatprep.align.warp import Warp, from_nearest, halved
-from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model
 
@@ -113,7 +111,7 @@ def deform_if_earned(
                 nearest, warp = from_nearest(pose, warp, points, parameters.scale_bounds)
                 kept = warp.record(slat.points, parameters.max_displacement)
             if kept is not None:
-                model, warp = Model(tried), warp._replace(**_in_voxels(kept))
+                model, warp = Model(tried), warp.as_recorded(kept)
                 if nearest is not pose:
                     pose = nearest
                     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
@@ -146,12 +144,3 @@ def fit(slat: Surface, pixie: Surface, pose: Similarity, trial: Trial, model: st
     for level, taus in enumerate(LATTICE_TAUS):
         warp = residuals.fit_lattice(halved(warp) if level else warp, taus, everything)
     return warp
-
-
-def _in_voxels(kept: Deformation) -> dict[str, Any]:
-    """Return a record's numbers in the units of a `Warp`."""
-    affine = kept.affine.copy()
-    affine[:, 3] /= VOXEL_SIZE
-    if not kept.coefficients.size:
-        return {"affine": affine}
-    return {"affine": affine, "coefficients": kept.coefficients / VOXEL_SIZE}

@@ -49,6 +49,14 @@ class Warp(NamedTuple):
             lattice = origin * VOXEL_SIZE, spacing * VOXEL_SIZE, coefficients * VOXEL_SIZE
         return make_deformation(affine, *lattice, points * VOXEL_SIZE, max_displacement)
 
+    def as_recorded(self, kept: Deformation) -> Warp:
+        """Return it with the numbers of the deformation that `record` made of it."""
+        affine = kept.affine.copy()
+        affine[:, 3] /= VOXEL_SIZE
+        if not kept.coefficients.size:
+            return self._replace(affine=affine)
+        return self._replace(affine=affine, coefficients=kept.coefficients / VOXEL_SIZE)
+
 
 def halved(warp: Warp) -> Warp:
     """Return the same warp on a lattice of half the spacing."""
