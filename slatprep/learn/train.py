@@ -151,7 +151,7 @@ def train(
     may differ. `workers` processes read ahead. `steps` gets the number of batches done and of all,
     in this call alone; `stop_after` epochs it stops, as if interrupted. ConfigError if `out` holds
     another run, a split has no asset, or the training diverged before any epoch was worth keeping;
-    InputError if a checkpoint is damaged.
+    where it diverges later it ends. InputError if a checkpoint is damaged.
     """
     opened = open_store(store, copy=True)
     assignment = assign_store(opened, parameters.split_by, parameters.shares)
