@@ -1,7 +1,6 @@
 """Datasets of small made assets, and a build of one."""
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from support.deformed import add_deformed
 from support.synthetic import Dataset, Made, MakeDataset, make_asset
+from support.trees import copied
 
 from slatprep.pipeline import rows
 from slatprep.pipeline.dataset import BuildSummary, build_store
@@ -73,8 +73,7 @@ def store(mixed_build: BuildSummary) -> Path:
 @pytest.fixture
 def copy(mixed_build: BuildSummary, tmp_path: Path) -> Path:
     """Return a copy of the store that may be changed, its records beside it."""
-    shutil.copytree(mixed_build.records.parent, tmp_path / "copy.manifests")
-    return Path(shutil.copytree(str(mixed_build.store), tmp_path / "copy.zarr"))
+    return copied(Path(str(mixed_build.store)), tmp_path / "copy.zarr")
 
 
 @pytest.fixture(scope="session")

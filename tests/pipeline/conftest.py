@@ -14,11 +14,13 @@ from slatprep.pipeline.dataset import build_store
 
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
-    """Collect what builds reach, but for the folder that each makes and locks."""
+    """Collect what the last build has reached since it locked its folder."""
     found: list[tuple[str, str]] = []
 
     def collect(step: str, name: str) -> None:
-        if not step.startswith("work folder"):
+        if step.startswith("work folder"):
+            found.clear()
+        else:
             found.append((step, name))
 
     inject(monkeypatch, collect)

@@ -29,8 +29,7 @@ def test_names_that_are_not_utf_8_cost_their_assets_alone(make_dataset, tmp_path
     assert all(f"{name}\\udcff" in told for name in ("b", "c", "sample_d"))
     json.dumps(summary.problems).encode()
     assert len(records_of(summary.records)) == sum(summary.statuses.values())
-    again = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    assert again.build_id == summary.build_id
+    assert build_store(dataset.parameters(), tmp_path / "s.zarr").build_id == summary.build_id
 
 
 # Half a pair of surrogates, and what lies beyond Unicode.
@@ -59,8 +58,7 @@ def test_a_store_cannot_have_a_name_that_is_not_utf_8(make_dataset, tmp_path):
         build_store(dataset.parameters(), tmp_path / BAD)
     assert not (tmp_path / BAD).exists()
     sources = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
-    told = run("build-store", *sources, "--out", tmp_path / BAD, code=2)
-    assert "UTF-8" in told.output
+    assert "UTF-8" in run("build-store", *sources, "--out", tmp_path / BAD, code=2).output
     assert not [path for path in tmp_path.iterdir() if path != dataset.root]
 
 

@@ -1,13 +1,12 @@
 """What a build takes over from the store that is there is checked first, and else made anew."""
 
-import json
 import shutil
-from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
 import pytest
 import zarr
 from support.faults import flip
+from support.made_store import edit_record, rewrite
 from support.synthetic import Made
 from support.trees import tree
 
@@ -46,8 +45,7 @@ def test_a_flipped_bit_of_a_record_is_never_inherited(built, undisturbed, aligne
 
 @pytest.mark.parametrize("text", ["", "[" * 100_000])
 def test_a_record_that_is_none_is_made_anew(built, undisturbed, text):
-    _, out = built
-    zarr.open_group(out, mode="r+", use_consolidated=False)["asset/record"][1] = text
+    rewrite(built[1], "asset/record", 1, text)
     assert rebuilt(built, undisturbed).damaged
 
 
@@ -76,26 +74,18 @@ def test_rows_that_are_gone_are_written_again(built):
     assert tree(out) == before
 
 
-def rewritten(out: Path, change: Callable[[zarr.Group], None]) -> None:
-    """Change a store's values and make its digests anew, as if they had always been so."""
-    root = zarr.open_group(out, mode="r+", use_consolidated=False)
-    change(root)
-    shutil.rmtree(out / FILE)
-    write_digests(out)
-    zarr.consolidate_metadata(str(out), zarr_format=3)
-
-
 @pytest.mark.filterwarnings("ignore:Consolidated metadata")
 def test_a_transform_that_gives_other_labels_is_found_anew(built, undisturbed, aligned):
     """Every checksum and digest is right, and yet the record is not of these rows."""
     _, out = built
 
-    def shift(root: zarr.Group) -> None:
-        record = json.loads(str(root["asset/record"][1]))
+    def shift(record: dict[str, Any]) -> None:
         record["alignment"]["transform"][0][3] += 0.25
-        root["asset/record"][1] = json.dumps(record)
 
-    rewritten(out, shift)
+    edit_record(out, 1, shift)
+    shutil.rmtree(out / FILE)
+    write_digests(out)
+    zarr.consolidate_metadata(str(out), zarr_format=3)
     assert StoredRecords(open_store(out)).of("b").alignment.transform[0, 3] > 0.2
     (told,) = rebuilt(built, undisturbed).damaged
     assert told.startswith("b: ")

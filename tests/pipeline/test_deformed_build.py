@@ -2,14 +2,16 @@
 
 import json
 import shutil
+from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
 import plyfile
 import pytest
-import zarr
 from scipy.spatial import cKDTree
 from support.deformed import MOVES
+from support.made_store import edit_record, rewrite
 
 from slatprep import Store, open_store
 from slatprep.export import ExportOptions, export_store
@@ -51,12 +53,11 @@ def test_each_voxel_was_looked_up_where_it_lies(store):
 
 def test_the_record_holds_the_map_to_the_last_bit(store):
     schema = json.loads((FOLDER / "asset_record.schema.json").read_text())
-    records = StoredRecords(store)
     for asset in store:
         text = str(store.read_rows("asset/record", asset.index, asset.index + 1)[0])
         assert to_json(read_asset_record(text, "here")) == text.encode()
         jsonschema.Draft202012Validator(schema).validate(json.loads(text))
-        way = records.place_map(asset)
+        way = StoredRecords(store).place_map(asset)
         assert way.deformation is not None
         assert way.places(asset.coords).astype(np.float32).tobytes() == asset.place.tobytes()
 
@@ -69,20 +70,17 @@ def test_a_sound_store_verifies_and_checks(store):
 
 @pytest.mark.parametrize("what", ["place", "coefficients", "model"])
 def test_another_map_than_the_places_is_found(store, what, tmp_path):
-    shutil.copytree(store.path, tmp_path / "s.zarr")  # type: ignore[type-var]
-    root = zarr.open_group(tmp_path / "s.zarr", mode="r+", use_consolidated=False)
+    def bend(record: dict[str, Any]) -> None:
+        record["alignment"]["deformation"]["coefficients"][2][2][2][0] += 2**-8
+
+    out = Path(shutil.copytree(str(store.path), tmp_path / "s.zarr"))
     if what == "place":
-        root["voxel/place"][3] = root["voxel/place"][3] + np.float32(2**-12)
+        rewrite(out, "voxel/place", 3, store["bent"].place[3] + np.float32(2**-12))
+    elif what == "model":
+        edit_record(out, 0, lambda record: record["alignment"].update(deformation=None))
     else:
-        record = json.loads(str(root["asset/record"][0]))
-        if what == "model":
-            record["alignment"]["deformation"] = None
-        else:
-            record["alignment"]["deformation"]["coefficients"][2][2][2][0] += 2**-8
-        texts = root["asset/record"][:]
-        texts[0] = json.dumps(record)
-        root["asset/record"][:] = texts
-    findings = verify_store(tmp_path / "s.zarr").findings
+        edit_record(out, 0, bend)
+    findings = verify_store(out).findings
     assert [f.asset for f in findings if f.file == "voxel/place"] == ["bent"]
     assert any("without a deformation" in f.what for f in findings) == (what == "model")
 

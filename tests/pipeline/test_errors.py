@@ -1,8 +1,6 @@
 """Decoys of a real store: drawn by ids and size, aligned once, with builds too, told in words."""
 
 import json
-import shutil
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.commands import run
-from support.trees import tree
+from support.trees import copied, tree
 
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
@@ -24,9 +22,7 @@ from slatprep.store.records import ERRORS, manifests_of
 def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """Copy a store with its records, beside which decoys are kept."""
     path = tmp_path_factory.mktemp("errors") / "s.zarr"
-    shutil.copytree(Path(str(mixed_build.store)), path)
-    shutil.copytree(Path(str(mixed_build.records)).parent, Path(str(manifests_of(path))))
-    return open_store(path)
+    return open_store(copied(Path(str(mixed_build.store)), path))
 
 
 def test_decoys_are_of_other_objects_and_are_aligned_once(store):
@@ -81,9 +77,7 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     assert set(found["errors"]) <= set(store.ids)
     assert (tmp_path / "errors.svg").read_text().startswith("<?xml")
     measured, asset_id = measured_errors(store.path), store.ids[0]
-    assert measured is not None
-    shown = run("info", store.path)
-    assert all(sentence in shown.output for sentence in measured.sentences())
+    assert all(sentence in run("info", store.path).output for sentence in measured.sentences())
     words = ("check-alignment", "--asset", asset_id, "--store", store.path, "--picture", "none")
     assert "the probability of another object" not in run(*words).output
     assert "another_object" not in json.loads(run(*words, "--json").stdout)["assets"][0]
@@ -100,8 +94,7 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     assert "is 25.0%" in replace(measured, errors={asset_id: 0.25}).of_asset(asset_id)
 
     file = manifests_of(store.path) / ERRORS
-    document = json.loads(file.read_bytes())
-    file.write_text(json.dumps(document | {"build": "another"}))
+    file.write_text(json.dumps(json.loads(file.read_bytes()) | {"build": "another"}))
     assert told_of(store)[:-1] == measured.sentences()
     assert told_of(store)[-1].startswith("measured before the last update, when there were 5")
     file.write_text("{")
@@ -126,9 +119,7 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, t
     build_store(parameters, one)
     build_store(parameters, two, jobs=2)
     build_store(parameters, none, decoys=0)
-    measured = measured_errors(one)
-    assert measured is not None
-    assert len(measured.decoys) == len(OBJECTS) // decoys.EVERY
+    assert len(measured_errors(one).decoys) == len(OBJECTS) // decoys.EVERY
     assert (manifests_of(one) / ERRORS).read_bytes() == (manifests_of(two) / ERRORS).read_bytes()
     assert tree(one) == tree(two) == tree(none)
     assert not (manifests_of(none) / ERRORS).exists()
@@ -143,34 +134,33 @@ def test_stores_with_one_folder_of_records_keep_their_own_errors(make_dataset, t
     build_store(replace(parameters, name="two"), two, manifests=tmp_path / "records")
     link.symlink_to("demo")
     for store in (one, two, link):
-        measured = measured_errors(store)
-        assert measured is not None
-        assert measured.build == open_store(store).about.manifest
+        assert measured_errors(store).build == open_store(store).about.manifest
     assert measured_errors(one) != measured_errors(two)
 
 
+def align_decoy(*task: object) -> None:
+    raise ValueError("singular")
+
+
+def run_unordered(function: object, tasks: Any, jobs: object, died: Any) -> Any:
+    return (died(*task) for task in tasks)
+
+
 @pytest.mark.usefixtures("few_suffice")
-@pytest.mark.parametrize("fault", ["raised", "killed"])
-def test_a_decoy_that_cannot_be_aligned_costs_no_build(make_dataset, tmp_path, monkeypatch, fault):
-    def raising(*task: object) -> None:
-        raise ValueError("singular")
-
-    def killing(function: object, tasks: Iterable[tuple[Any, ...]], jobs: object, died: Any) -> Any:
-        return (died(*task) for task in tasks)
-
-    names = {"raised": ("align_decoy", raising), "killed": ("run_unordered", killing)}
-    monkeypatch.setattr(decoys, *names[fault])
+@pytest.mark.parametrize(
+    ("fault", "said"), [(align_decoy, "singular"), (run_unordered, "killed its worker process")]
+)
+def test_a_decoy_not_aligned_costs_no_build(make_dataset, tmp_path, monkeypatch, fault, said):
+    monkeypatch.setattr(decoys, fault.__name__, fault)
     summary = build_store(make_dataset(*OBJECTS).parameters(), tmp_path / "s.zarr")
     assert summary.complete
     assert summary.warnings[-1].startswith("errors were not measured")
-    said = {"raised": "singular", "killed": "killed its worker process"}
-    assert said[fault] in summary.warnings[-1] and "replaced" not in summary.warnings[-1]
+    assert said in summary.warnings[-1] and "replaced" not in summary.warnings[-1]
 
 
 @pytest.mark.usefixtures("few_suffice", "few_are_new")
 def test_a_small_update_measures_nothing_and_a_larger_one_takes_decoys_over(make_dataset, tmp_path):
-    out = tmp_path / "s.zarr"
-    dataset = make_dataset(*OBJECTS)
+    out, dataset = tmp_path / "s.zarr", make_dataset(*OBJECTS)
     build_store(dataset.parameters(), out)
     first, text = measured_errors(out), (manifests_of(out) / ERRORS).read_bytes()
     verdicts = open_store(out).column("verdict").tolist()
@@ -184,7 +174,6 @@ def test_a_small_update_measures_nothing_and_a_larger_one_takes_decoys_over(make
         dataset.add(name, seed)
     build_store(dataset.parameters(), out)
     after = measured_errors(out)
-    assert first is not None and after is not None
     assert after.build == open_store(out).about.manifest != first.build
     # Not by their evidence, in which two NaN are not equal.
     old = {(one.grid, one.slat, one.keys) for one in first.decoys}

@@ -1,5 +1,6 @@
 """SLATs on other grids than the frames' 64^3: placed, looked up and used at their own voxels."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,16 +57,14 @@ def test_sides_are_placed_and_labels_are_right(demo):
     scores = score_against_truth(demo / "s.zarr", demo / "demo" / "truth").assets
     assert len(scores) == len(store)
     # A face of a shell may lie anywhere in its voxels: by half of one a placement may be off.
-    allowed = 0.5 * 64 / side_of(demo)
     for score in scores:
         assert score.valid_share > 0.99 and score.label_accuracy > 0.97
-        assert score.symmetric or score.displacement < allowed
+        assert score.symmetric or score.displacement < 0.5 * 64 / side_of(demo)
 
 
 def test_each_voxel_is_looked_up_at_its_own_centre(demo):
-    side = side_of(demo)
     for asset in open_store(demo / "s.zarr"):
-        centres = centres_of(asset.coords, side)
+        centres = centres_of(asset.coords, side_of(demo))
         np.testing.assert_allclose(asset.latents.centres, centres, atol=1e-15)
         inverse = np.linalg.inv(asset.transform)
         places = centres @ inverse[:3, :3].T + inverse[:3, 3]
@@ -79,20 +78,17 @@ def test_each_voxel_is_looked_up_at_its_own_centre(demo):
 
 def test_a_store_of_another_grid_is_sound_and_can_be_shown(demo, tmp_path):
     store = open_store(demo / "s.zarr")
-    report = verify_store(demo / "s.zarr", sources=True)
-    assert not report.findings
+    assert not verify_store(demo / "s.zarr", sources=True).findings
     asset = next(iter(store))
     assert check_alignment(store, asset.asset_id).ok
     scene = scene_of(asset)
     # Cells of the frame, each with the class of a voxel that covers it or lies in it.
-    touched = np.floor((asset.latents.centres + 0.5) * 64)
-    gap, _ = cKDTree(touched).query(scene.slat)
+    gap, _ = cKDTree(np.floor((asset.latents.centres + 0.5) * 64)).query(scene.slat)
     assert gap.max() <= np.sqrt(3)
     assert set(np.unique(scene.slat_material)) == set(np.unique(asset.material))
     assert thumbnail(asset).shape == (SIDE, 3 * SIDE)
-    way = StoredRecords(store).place_map(asset)
     for level in (FULL, COARSE):
-        assert len(encode_asset(asset, way, level)) > 100
+        assert len(encode_asset(asset, StoredRecords(store).place_map(asset), level)) > 100
     picture = ("--picture", tmp_path / "pictures")
     run("check-alignment", "--store", demo / "s.zarr", "--asset", asset.asset_id, *picture)
 
@@ -119,11 +115,8 @@ def test_its_points_are_the_voxels_centres(demo, tmp_path):
 
 def test_the_passes_over_a_dataset_know_the_grid(demo, tmp_path):
     parameters = load_parameters(demo / "demo" / "dataset.toml")
-    parameters = replace(
-        parameters,
-        consensus=replace(parameters.consensus, settle=True),
-        witness=WitnessParameters(settle=True),
-    )
+    consensus = replace(parameters.consensus, settle=True)
+    parameters = replace(parameters, consensus=consensus, witness=WitnessParameters(settle=True))
     build_store(parameters, tmp_path / "s.zarr")
     assert not verify_store(tmp_path / "s.zarr").findings
     before = (tmp_path / "s.zarr" / "zarr.json").read_bytes()
@@ -132,19 +125,13 @@ def test_the_passes_over_a_dataset_know_the_grid(demo, tmp_path):
 
 
 def test_stores_of_other_grids_are_not_joined_and_have_no_voxel_in_common(demo, tmp_path):
-    side = side_of(demo)
-    store = open_store(demo / "s.zarr")
-    space = store.contents.latents
-    description = tmp_path / "other.json"
-    other = 2 * side if side == 32 else 256
-    description.write_text(
-        f'{{"encoder": "{space.encoder}", "channels": {space.channels}, "resolution": {other}}}'
-    )
-    parameters = load_parameters(demo / "demo" / "dataset.toml")
-    build_store(
-        replace(parameters, slat=replace(parameters.slat, encoder=str(description), pattern=FILES)),
-        tmp_path / "other.zarr",
-    )
+    store, side = open_store(demo / "s.zarr"), side_of(demo)
+    space, other = store.contents.latents, 2 * side
+    description, parameters = tmp_path / "d.json", load_parameters(demo / "demo" / "dataset.toml")
+    about = {"encoder": space.encoder, "channels": space.channels, "resolution": other}
+    description.write_text(json.dumps(about))
+    slat = replace(parameters.slat, encoder=str(description), pattern=FILES)
+    build_store(replace(parameters, slat=slat), tmp_path / "other.zarr")
     for number, path in enumerate((demo / "s.zarr", tmp_path / "other.zarr")):
         subset_store(path, tmp_path / f"{number}.zarr", [store.ids[number]])
     with pytest.raises(ConfigError, match=rf"{other}\^3 voxels.*{side}\^3 voxels"):
@@ -161,8 +148,7 @@ def test_a_decoder_is_trained_and_used_on_its_grid(demo, tmp_path):
     train(demo / "s.zarr", trained, chosen)
     out = tmp_path / "predictions"
     run("predict", demo / "s.zarr", "--checkpoint", trained, "--out", out)
-    store = open_store(demo / "s.zarr")
-    for asset_id in store.ids:
+    for asset_id in open_store(demo / "s.zarr").ids:
         with np.load(out / f"{asset_id}.npz") as arrays:
             assert arrays["resolution"] == side_of(demo)
         assert len(predicted_field(out / f"{asset_id}.npz", None).voxels) > 100

@@ -10,7 +10,7 @@ import pytest
 from support.commands import run
 from support.made_store import edit_attributes
 from support.synthetic import Dataset
-from support.trees import records_of, tree
+from support.trees import copied, records_of, tree
 
 from slatprep import ConfigError, StoreError, build_store, concat_stores, open_store, subset_store
 from slatprep.inspect.verify import verify_store
@@ -143,8 +143,7 @@ def test_a_source_is_never_replaced_whatever_path_leads_there(folder, tmp_path, 
 
 @pytest.mark.parametrize("how", ["none", "broken", "stale"])
 def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(folder, tmp_path, how):
-    shutil.copytree(folder / "ac.zarr", tmp_path / "s.zarr")
-    shutil.copytree(folder / "ac.manifests", tmp_path / "s.manifests")
+    store = copied(folder / "ac.zarr", tmp_path / "s.zarr")
     file = tmp_path / "s.manifests" / "build.json"
     if how == "none":
         file.unlink()
@@ -152,7 +151,7 @@ def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(folder, 
         file.write_text("[" * 100_000)
     else:
         shutil.copy(folder / "bd.manifests" / "build.json", file)
-    summary = subset_store(tmp_path / "s.zarr", tmp_path / "a.zarr", ["a"])
+    summary = subset_store(store, tmp_path / "a.zarr", ["a"])
     told = json.loads((summary.records.parent / "build.json").read_text())
     assert told["parameters"]["pixieverse"]["root"] == "unknown"
 

@@ -41,25 +41,17 @@ def of_latents(warnings: tuple[str, ...]) -> list[str]:
 
 def test_a_store_says_which_encoder_made_its_latents(mixed_build):
     assert of_latents(mixed_build.warnings) == []
-    assert open_store(mixed_build.store).attributes["latents"] == {
-        "encoder": "trellis",
-        "channels": 8,
-        "resolution": 64,
-        "mean": list(FEATS_MEAN),
-        "std": list(FEATS_STD),
-        "standardised": False,
-    }
+    latents = {"encoder": "trellis", "channels": 8, "resolution": 64, "standardised": False}
+    moments = {"mean": list(FEATS_MEAN), "std": list(FEATS_STD)}
+    assert open_store(mixed_build.store).attributes["latents"] == latents | moments
 
 
 def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tmp_path):
     raw = {name: asset.feats.copy() for name, asset in dataset.assets.items()}
     rewrite(dataset, lambda feats: (feats - MEAN) / STD)
     out = tmp_path / "s.zarr"
-    summary = build_store(dataset.parameters(), out)
-    warnings = of_latents(summary.warnings)
-    assert len(warnings) == 1
-    assert "look standardised already" in warnings[0]
-    assert 'slat.standardised = "yes"' in warnings[0]
+    (warning,) = of_latents(build_store(dataset.parameters(), out).warnings)
+    assert "look standardised already" in warning and 'slat.standardised = "yes"' in warning
     store = open_store(out)
     assert store.contents.latents.standardised
     np.testing.assert_array_equal(store.asset("a").feats, dataset.assets["a"].feats)
@@ -67,7 +59,6 @@ def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tm
     data = SlatDataset(store)
     item = data[data.asset_ids.index("a")]
     np.testing.assert_array_equal(item.feats.numpy(), dataset.assets["a"].feats)
-
     export_store(out, tmp_path / "npz", "npz", assets=["a"])
     with np.load(next((tmp_path / "npz").glob("**/a.npz"))) as file:
         np.testing.assert_allclose(file["feats"], raw["a"], atol=1e-5)
@@ -92,9 +83,8 @@ def test_one_asset_unlike_the_others_is_named(dataset, tmp_path):
     asset = dataset.assets["c"]
     dataset.write_slat("c.npz", asset.coords, (asset.feats - MEAN) / STD)
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
-    warnings = of_latents(summary.warnings)
-    assert len(warnings) == 1
-    assert "1 of 6 assets look standardised already, unlike the others (c)" in warnings[0]
+    (warning,) = of_latents(summary.warnings)
+    assert "1 of 6 assets look standardised already, unlike the others (c)" in warning
     records = records_of(summary.records)
     assert [name for name, record in records.items() if record["warnings"]] == ["c"]
 
@@ -118,16 +108,14 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
     assert checkpoint.contents == store.contents
     asset = store.asset("a")
     standard = store.contents.latents.standardise(asset.feats)
-    said = [
-        next(predict(checkpoint, [StructuredLatents(asset.coords, feats, standardised=done)]))
-        for feats, done in ((asset.feats, False), (standard, True))
-    ]
-    np.testing.assert_array_equal(said[0].properties, said[1].properties)
+    raw = StructuredLatents(asset.coords, asset.feats)
+    done = StructuredLatents(asset.coords, standard, standardised=True)
+    said, same = (next(predict(checkpoint, [one])).properties for one in (raw, done))
+    np.testing.assert_array_equal(said, same)
 
     # Nothing is done again, and what is joined has the moments of all.
     assert build_store(parameters, out).build_id == str(store.attributes["manifest"])
-    other = Dataset(tmp_path / "others")
-    other.add("x", 3)
+    other = Dataset(tmp_path / "others").having("x", seed=3)
     rewrite(other, lambda feats: np.tile(feats, 4)[:, :20])
     build_store(other.parameters(slat={"encoder": str(description)}), tmp_path / "o.zarr")
     concat_stores([out, tmp_path / "o.zarr"], tmp_path / "both.zarr")
@@ -144,10 +132,7 @@ def test_attributes_that_do_not_fit_the_arrays_are_refused(copy):
 
 
 def write_both(dataset: Dataset, seed: int = 0) -> dict[str, np.ndarray]:
-    """Write shape and texture latents as TRELLIS.2's toolkit does; return both, by asset.
-
-    Those of the texture are in another order of voxels.
-    """
+    """Write latents as TRELLIS.2's toolkit does, the texture's in another order; return both."""
     rng, both = np.random.default_rng(seed), {}
     for name, asset in dataset.assets.items():
         feats = rng.normal(size=(len(asset.coords), 64)).astype(np.float32) * 4
@@ -174,8 +159,7 @@ def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
     assert build_store(of_both(dataset), out).statuses["ok"] == 6
     store = open_store(out)
     for asset in store:
-        own = dataset.assets[asset.asset_id].coords
-        np.testing.assert_array_equal(asset.coords, own)
+        np.testing.assert_array_equal(asset.coords, dataset.assets[asset.asset_id].coords)
         np.testing.assert_array_equal(asset.feats, both[asset.asset_id])
     space = store.contents.latents
     assert (space.encoder, space.channels, len(space.std)) == ("trellis2-shape-pbr", 64, 64)

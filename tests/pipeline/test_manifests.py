@@ -34,19 +34,12 @@ def update(dataset: Dataset, lines: Path) -> list[str]:
     return list(records_of(lines))
 
 
-@pytest.fixture
-def two_a_shard(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cut records into shards of two rows."""
+def test_lines_stay_where_their_shard_does(make_dataset, tmp_path, monkeypatch):
     for module in (layout, records, rows):
         monkeypatch.setattr(module, "RECORDS_IN_SHARD", 2)
     for module in (layout, records):
         monkeypatch.setattr(module, "RECORDS_IN_CHUNK", 2)
-
-
-@pytest.mark.usefixtures("two_a_shard")
-def test_lines_are_those_of_shards_and_stay_where_their_shard_does(make_dataset, tmp_path):
-    dataset, out = make_dataset("a", "c"), tmp_path / "s.zarr"
-    folder = tmp_path / "s.manifests"
+    dataset, out, folder = make_dataset("a", "c"), tmp_path / "s.zarr", tmp_path / "s.manifests"
     assert build_store(dataset.parameters(), out).records == folder / "assets.jsonl"
 
     def lines() -> dict[str, list[str]]:
@@ -54,8 +47,7 @@ def test_lines_are_those_of_shards_and_stay_where_their_shard_does(make_dataset,
 
     for name, seed in (("e", 2), ("g", 3), ("b", 4)):
         dataset.add(name, seed)
-    summary = build_store(dataset.parameters(), out)
-    assert summary.records == folder / "assets-*.jsonl"
+    assert build_store(dataset.parameters(), out).records == folder / "assets-*.jsonl"
     assert lines() == {
         "assets-00000.jsonl": ["a", "b"],
         "assets-00001.jsonl": ["c", "e"],
@@ -63,8 +55,7 @@ def test_lines_are_those_of_shards_and_stay_where_their_shard_does(make_dataset,
     }
     assert verify_store(out).ok
     before = {file.name: file.stat().st_ino for file in folder.glob("*.jsonl")}
-    dataset.add("e", seed=7)
-    dataset.add("d", seed=8)
+    dataset.having("e", "d", seed=7)
     build_store(dataset.parameters(), out)
     assert lines()["assets-00002.jsonl"] == ["g", "d"]
     same = [name for name, ino in before.items() if (folder / name).stat().st_ino == ino]

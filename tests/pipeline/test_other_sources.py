@@ -57,10 +57,7 @@ STRICT = SampleParameters("nearest", max_unphysical=1)
 
 
 def voxels_of(seed: int, slabs: int = 0) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
-    """Return the voxels of the synthetic L, its columns and its classes.
-
-    With `slabs` these are slabs across it, each of another of so many classes.
-    """
+    """Return voxels, columns and classes of the synthetic L, or of so many slabs across it."""
     grid = make_asset(seed).grid
     voxels = np.argwhere(grid[..., 3] != 7)
     rows = grid[tuple(voxels.T)]
@@ -114,14 +111,12 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form,
     assert bool(store.contents.classes) is classes
     for seed, asset in enumerate(store):
         voxels, columns, material = voxels_of(seed)
-        places = np.asarray(asset.place, np.float64) * 64 + 31.5
-        _, used = cKDTree(voxels).query(places)
+        _, used = cKDTree(voxels).query(np.asarray(asset.place, np.float64) * 64 + 31.5)
         assert asset.valid.all()
         np.testing.assert_array_equal(asset.material, material[used] if classes else 0 * used)
         for name, values in zip(NAMES, asset.properties_si.T, strict=True):
             np.testing.assert_allclose(values, columns[name][used], rtol=1e-5, atol=1e-4)
-    verification = verify_store(out)
-    assert not verification.findings
+    assert not verify_store(out).findings
     told = run("info", out).stdout
     assert '"FILE.json" under [pairing]' in told and "obj_ids_metadata" not in told
 
@@ -162,8 +157,7 @@ def test_classes_of_a_source_s_own_are_told_by_their_names(tmp_path):
     found = store_statistics(store)
     counts = np.sum([np.bincount(voxels_of(seed)[2]) for seed in range(2)], axis=0)
     assert [one.name for one in found.classes] == own
-    shares = [found.total.field.classes[name] for name in own]
-    assert shares == pytest.approx(counts / counts.sum())
+    assert [found.total.field.classes[name] for name in own] == pytest.approx(counts / counts.sum())
     with pytest.raises(StoreError, match=r"has classes of its own \(soft wood, steel\)"):
         stored_field(store, "a")
     # Another name is another table: nothing is taken over.
@@ -202,8 +196,7 @@ def test_other_grids_lie_where_they_should(tmp_path, side):
     np.save(tmp_path / "voxels" / "frame.npy", QUARTER_TURN)
     build_store(parameters_of(tmp_path, transform="frame.npy"), tmp_path / "s.zarr")
     (asset,) = open_store(tmp_path / "s.zarr")
-    centres = (voxels + 0.5) / side - 0.5
-    apart, used = cKDTree(centres).query(np.asarray(asset.place, np.float64))
+    apart, used = cKDTree((voxels + 0.5) / side - 0.5).query(np.asarray(asset.place, np.float64))
     assert apart.max() < 2 / side
     right = np.isclose(asset.properties_si[:, 1], arrays["yield_stress"][used], rtol=0.1)
     assert right.mean() > 0.95
@@ -215,8 +208,7 @@ def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path):
         write_vomp(tmp_path / "voxels", name, *voxels_of(seed)[:2])
         asset = make_asset(seed)
         coords = np.argwhere(boundary(asset.grid[..., 3] != 7)).astype(np.uint8)
-        feats = asset.feats[: len(coords)]
-        np.savez(tmp_path / "slat" / f"{name}.npz", coords=coords, feats=feats)
+        np.savez(tmp_path / "slat" / f"{name}.npz", coords=coords, feats=asset.feats[: len(coords)])
     summary = build_store(parameters_of(tmp_path, "vomp", align=KNOWN), tmp_path / "s.zarr")
     assert summary.verdicts == {"good": 2}
     store = open_store(tmp_path / "s.zarr")
@@ -231,8 +223,7 @@ def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path):
 @pytest.mark.parametrize("suffix", ["json", "npy"])
 def test_a_frame_that_is_known_is_checked(tmp_path, suffix):
     write(tmp_path, "ab")
-    frames = {"a": QUARTER_TURN, "b": QUARTER_TURN.T}  # of b, turned the wrong way
-    for name, frame in frames.items():
+    for name, frame in {"a": QUARTER_TURN, "b": QUARTER_TURN.T}.items():
         path = tmp_path / "voxels" / f"{name}.frame.{suffix}"
         if suffix == "npy":
             np.save(path, frame)
@@ -254,8 +245,7 @@ def test_every_file_that_decides_an_asset_is_looked_at_again(tmp_path):
     write(tmp_path, "ab")
     frame = tmp_path / "voxels" / "frame.json"
     frame.write_text(json.dumps(QUARTER_TURN.tolist()))
-    parameters = parameters_of(tmp_path, transform="frame.json")
-    out = tmp_path / "s.zarr"
+    parameters, out = parameters_of(tmp_path, transform="frame.json"), tmp_path / "s.zarr"
     assert build_store(parameters, out).verdicts == {"good": 2}
     frame.write_text(json.dumps(QUARTER_TURN.T.tolist()))
     assert build_store(parameters, out).verdicts == {"failed": 2}

@@ -1,13 +1,12 @@
 """The passes over a whole dataset: the consensus, and the witness of telling latents."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
-from support.trees import inodes, records_beside, tree
+from support.trees import copied, inodes, records_beside, tree
 
 from slatprep import load_parameters, make_demo, open_store
 from slatprep.inspect.check import check_alignment
@@ -19,12 +18,6 @@ from slatprep.pipeline.dataset import build_store, plan_build
 
 SETTLED = ConsensusParameters(settle=True)
 HEARD = WitnessParameters(settle=True)
-
-
-def copied(store: Path, to: Path) -> Path:
-    """Copy a store and its records: what is built on it need not be aligned again."""
-    shutil.copytree(store.with_suffix(".manifests"), to.with_suffix(".manifests"))
-    return Path(shutil.copytree(store, to))
 
 
 def assert_same_labels(stores: tuple[Path, Path], row: int) -> None:
@@ -54,8 +47,7 @@ def agreed(habitual: tuple[Path, BuildParameters]) -> tuple[Path, Path]:
 
 
 def test_more_symmetric_assets_are_placed_right_and_no_other_changes(habitual, agreed):
-    truth = habitual[0] / "truth"
-    before, after = (score_against_truth(store, truth).assets for store in agreed)
+    before, after = (score_against_truth(store, habitual[0] / "truth").assets for store in agreed)
     symmetric = [k for k, score in enumerate(before) if score.symmetric]
     right = [sum(scores[k].displacement < 1.5 for k in symmetric) for scores in (before, after)]
     assert len(symmetric) >= 2
@@ -143,8 +135,7 @@ def right_labels(root: Path, store: Path) -> dict[str, float]:
     shares = {}
     for asset in open_store(store):
         truth = np.load(root / "truth" / f"{asset.asset_id}.npz")
-        valid = asset.valid
-        shares[asset.asset_id] = float((asset.material == truth["material"])[valid].mean())
+        shares[asset.asset_id] = float((asset.material == truth["material"])[asset.valid].mean())
     return shares
 
 
@@ -212,8 +203,7 @@ def test_it_is_undone_by_building_without_it_and_the_same_for_any_jobs(telling, 
     store = copied(stores[0], tmp_path / "store.zarr")
     build_store(replace(parameters, witness=HEARD), store, jobs=2)
     assert tree(store) == tree(stores[1])
-    plan = plan_build(parameters, store)
-    assert {asset.action for asset in plan.assets} == {"reuse"}
+    assert {asset.action for asset in plan_build(parameters, store).assets} == {"reuse"}
     build_store(parameters, store)
     assert tree(store) == tree(stores[0])
 

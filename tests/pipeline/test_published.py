@@ -30,8 +30,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     "root", ["pixieverse", "tar", "tar/archives", "gz/archives/render_outputs"]
 )
 def test_store_of_archives_is_that_of_the_unpacked_folder(made, tmp_path, unpacked, root):
-    categories = root == "pixieverse"
-    summary = build_store(parameters(made, root, categories), tmp_path / "s.zarr")
+    summary = build_store(parameters(made, root, root == "pixieverse"), tmp_path / "s.zarr")
     assert summary.statuses == {"ok": 4, "failed": 0, "skipped": 1}
     assert tree(tmp_path / "s.zarr") == unpacked
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
@@ -65,8 +64,7 @@ def test_needed_members_alone_are_read_once(objects, made, tmp_path, monkeypatch
     whole = sum(path.stat().st_size for path in (made / "tar").rglob("*.tar"))
     assert 0 < sum(of_archives) - needed < 0.1 * whole
     of_archives.clear()
-    again = build_store(parameters(made, "tar"), tmp_path / "s.zarr", rehash=0)
-    assert again.statuses["ok"] == 4
+    assert build_store(parameters(made, "tar"), tmp_path / "s.zarr", rehash=0).statuses["ok"] == 4
     assert not of_archives
 
 

@@ -112,9 +112,7 @@ def test_a_single_value_gets_a_width(make_dataset, tmp_path):
     np.testing.assert_allclose(ranges_of(out), [[5.5, 6.5], [2.5, 3.5], [-0.25, 0.75]])
 
 
-def test_lists_and_ranges_that_cannot_be_used_are_told_before_any_work(
-    make_dataset, tmp_path, steps
-):
+def test_lists_and_ranges_of_no_use_are_told_before_any_work(make_dataset, tmp_path, steps):
     dataset, lists = make_dataset("a", "b"), tmp_path / "lists.json"
     chosen = of(dataset, ranges="p1-p99", objects="train", split_by=str(lists))
     for text, parameters, error, told in (

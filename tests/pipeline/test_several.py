@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.faults import inject
 from support.synthetic import Dataset, make_asset
-from support.trees import records_of, tree
+from support.trees import copied, records_of, tree
 
 from slatprep.errors import ConfigError, StoreError
 from slatprep.export import export_store
@@ -66,10 +66,9 @@ def write_second(root: Path, name: str, seed: int, factor: float = DENSER) -> No
 
 @pytest.fixture(scope="module")
 def several(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """Make three objects; nobody may change them.
+    """Make three objects, of which ``a`` has three samples, and ``b`` one in each of three sources.
 
-    ``a`` has three samples, of which the last calls the metal sand; ``b`` has one, and one more in
-    each of two further sources; ``c`` has one.
+    The last of each calls the metal sand. Nobody may change them.
     """
     dataset = Dataset(tmp_path_factory.mktemp("several")).having(*"abc")
     for sample, factor in enumerate(FACTORS):
@@ -203,8 +202,7 @@ def test_labels_are_made_again_of_sources_that_moved(own, tmp_path):
     )
     roots = SourceRoots(now / "pixieverse", now / "slat", also=(second, third))
     assert verify_store(out, sources=True, roots=roots).findings == ()
-    fewer = replace(roots, also=(second,))
-    (finding,) = verify_store(out, sources=True, roots=fewer).findings
+    (finding,) = verify_store(out, sources=True, roots=replace(roots, also=(second,))).findings
     assert "[[also]] 2, whose root is not known" in finding.what
 
 
@@ -276,8 +274,7 @@ def test_columns_are_the_store_s_in_whatever_order_the_first_source_has_them(own
 
 
 def test_a_change_in_any_annotation_redoes_that_object_alone(own, merged, tmp_path, aligned):
-    out = Path(shutil.copytree(str(merged.store), tmp_path / "s.zarr"))
-    shutil.copytree(merged.records.parent, tmp_path / "s.manifests")
+    out = copied(Path(str(merged.store)), tmp_path / "s.zarr")
     for name in "cb":
         assert {one.action for one in plan_build(asked(own), out).assets} == {"reuse"}
         if name == "c":
@@ -306,8 +303,7 @@ def test_a_grid_replaced_meanwhile_gets_no_key_of_others(own, tmp_path, monkeypa
     if ok == 2:
         assert "sample 1 was replaced while the build read it" in first.problems[0][1]
     again = build_store(asked(own), tmp_path / "s.zarr")
-    fresh = build_store(asked(own), tmp_path / "fresh.zarr")
-    assert tree(again.store) == tree(fresh.store)
+    assert tree(again.store) == tree(build_store(asked(own), tmp_path / "fresh.zarr").store)
 
 
 def test_a_store_gains_and_loses_its_spread_whatever_the_jobs(several, merged, plain, tmp_path):
@@ -416,8 +412,7 @@ def test_a_dataset_definition_names_further_sources(own):
         '[[also]]\nroot = "second"\nadapter = "voxels"\n'
     )
     path.write_text(text)
-    parameters = load_parameters(path)
-    assert parameters.also == (PixieverseSource(own.root / "second", adapter="voxels"),)
+    assert load_parameters(path).also == (PixieverseSource(own.root / "second", adapter="voxels"),)
     for wrong, words in (
         (text.replace("second", "fourth"), "also.root"),
         (text.replace("adapter", "adaptor"), "did you mean 'adapter'"),

@@ -66,9 +66,7 @@ def names(steps: list[tuple[str, str]], step: str) -> list[str]:
 def test_new_assets_come_behind_and_the_rest_stays_where_it_is(built, steps):
     dataset, out = built
     before, files = inodes(out), tree(out)
-    dataset.add("d", seed=1)
-    dataset.add("b", seed=2)
-    steps.clear()
+    dataset.having("d", "b", seed=1)
     summary = build_store(dataset.parameters(), out)
     assert names(steps, "asset read") == ["b", "d"]
     store = open_store(out)
@@ -93,7 +91,6 @@ def test_new_assets_come_behind_and_the_rest_stays_where_it_is(built, steps):
     built_anew = tree_from_nothing(dataset.parameters())
     assert tree(out) != built_anew
     assert list(records_of(out.with_name("s.manifests") / "assets.jsonl")) == list("acegbd")
-    steps.clear()
     compacted = build_store(dataset.parameters(), out, compact=True)
     assert names(steps, "asset aligned") == []
     assert compacted.build_id == summary.build_id
@@ -115,7 +112,6 @@ def test_larger_shards_are_made_of_chunks_as_they_are(make_dataset, monkeypatch,
     build_store(by_size, out)
     before = open_store(out).reader("voxel/feats").shard_rows
     dataset.add("h", seed=1)
-    steps.clear()
     build_store(by_size, out)
     assert open_store(out).reader("voxel/feats").shard_rows == 2 * before
     assert names(steps, "asset read") == ["h"]
@@ -147,7 +143,6 @@ def test_an_update_costs_what_changed_and_gives_the_bytes_of_a_first_build(built
     plan = plan_build(dataset.parameters(), out)
     assert {one.asset_id: one.reason for one in plan.assets if one.action != "reuse"} == why
     aligned = [one.asset_id for one in plan.assets if one.action == "align"]
-    steps.clear()
     build_store(dataset.parameters(), out)
     assert names(steps, "asset aligned") == aligned
     assert sorted(names(steps, "asset reused")) == list(reused)
@@ -185,11 +180,9 @@ def test_grids_that_move_are_not_unpacked(built, monkeypatch):
 
 def test_another_name_costs_a_record(built, steps, tmp_path):
     dataset, out = built
-    before = inodes(out)
-    categories = tmp_path / "categories.json"
+    before, categories = inodes(out), tmp_path / "categories.json"
     categories.write_text(json.dumps({"c": {"obj_class": "tree"}}))
     named = dataset.parameters(pairing={"categories": categories})
-    steps.clear()
     build_store(named, out)
     assert names(steps, "asset read") == []
     after = inodes(out)
@@ -266,7 +259,6 @@ def test_sources_that_are_as_they_were_are_not_read(built, steps):
     (dataset.root / "slat" / "c.npz").touch()
     build_store(dataset.parameters(), out)
     assert names(steps, "asset compared") == ["c"]
-    steps.clear()
     build_store(dataset.parameters(), out)
     assert steps == []
     build_store(dataset.parameters(), out, rehash=True)
@@ -308,7 +300,6 @@ def test_what_was_seen_is_not_trusted_without_reason(built, steps, monkeypatch, 
                 context.setattr(states, "COARSE_NS", 10**15)
                 context.setattr("time.sleep", lambda seconds: None)
                 build_store(dataset.parameters(), out, rehash=True)  # sees them as they are read
-            steps.clear()
             build_store(dataset.parameters(), out)
         assert names(steps, "asset compared") == list("aceg"), how
         assert names(steps, "asset read") == []
@@ -324,7 +315,6 @@ def test_what_was_seen_of_one_store_is_nothing_to_another(built, tmp_path, steps
     build_store(dataset.parameters(), out)
     shutil.rmtree(out)
     (tmp_path / "kept").rename(out)
-    steps.clear()
     build_store(dataset.parameters(), out)
     assert names(steps, "asset compared") == list("aceg")
     assert names(steps, "asset aligned") == ["c"]
@@ -349,7 +339,6 @@ def test_rows_that_other_code_packed_are_packed_anew_and_not_aligned(built, step
         assert names(steps, "asset aligned") == ["h"]
         assert sorted(names(steps, "asset reused")) == ["a", "c", "e", "g"]
         assert tree(out) == tree_from_nothing(dataset.parameters(), "other packing code")
-    steps.clear()
     build_store(dataset.parameters(), out)
     assert names(steps, "asset aligned") == []
     assert tree(out) == tree_from_nothing(dataset.parameters())
@@ -374,8 +363,7 @@ def test_a_worker_that_lives_on_reads_the_store_of_today(built):
     build_store(dataset.parameters(), out)
 
     def in_the_worker() -> list[str]:
-        there = SourceStore(open_store(out))
-        worker = pickle.loads(pickle.dumps(there))
+        worker = pickle.loads(pickle.dumps(SourceStore(open_store(out))))
         ids = worker.ids
         assert [worker.asset(one).asset_id for one in ids] == list(ids)
         return list(ids)

@@ -23,8 +23,7 @@ WAIT_S = 2 * states.FINE_NS / 1e9
 
 
 def built(dataset: Dataset, folder: Path, **how: object) -> dict[str, str]:
-    summary = build_store(dataset.parameters(), folder / "s.zarr", **how)  # type: ignore[arg-type]
-    return tree(summary.store)
+    return tree(build_store(dataset.parameters(), folder / "s.zarr", **how).store)
 
 
 @pytest.mark.parametrize("closed", [False, True])

@@ -11,7 +11,6 @@ import pytest
 from support.commands import document, run
 from support.faults import inject
 from support.first_builds import tree_from_nothing
-from support.synthetic import make_asset
 from support.trees import inodes, tree
 
 from slatprep import StoreError, open_store
@@ -34,14 +33,9 @@ def test_no_change_writes_nothing_and_one_that_keeps_size_and_times_is_seen(buil
     assert inodes(out.parent) == before
     told = json.loads((summary.records.parent / "build.json").read_text())
     assert told["id"] == summary.build_id == open_store(out).attributes["manifest"]
-    assert told["statuses"] == summary.statuses
-    assert told["verdicts"] == summary.verdicts
-    assert told["counts"] == {
-        "voxels": summary.n_voxels,
-        "valid": summary.n_valid,
-        "clipped": summary.clipped,
-        "unphysical": summary.n_unphysical,
-    }
+    assert (told["statuses"], told["verdicts"]) == (summary.statuses, summary.verdicts)
+    counts = {"voxels": summary.n_voxels, "valid": summary.n_valid, "clipped": summary.clipped}
+    assert told["counts"] == counts | {"unphysical": summary.n_unphysical}
 
     path = dataset.root / "slat" / "a.npz"
     state = path.stat()
@@ -57,9 +51,8 @@ def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     assert "changed" not in run("build-store", *words, "--out", out, "--decoys", "0").stdout
     again = run("build-store", *words, "--out", out, "--decoys", "0", "--verbose").stdout
     assert "changed: nothing; 3 assets reused" in again and "removed" not in again
-    assert [line.split()[:2] for line in again.splitlines() if line[:2] in ("a ", "b ", "c ")] == [
-        [name, "good"] for name in "abc"
-    ]
+    rows = [line.split()[:2] for line in again.splitlines() if line[:2] in ("a ", "b ", "c ")]
+    assert rows == [[name, "good"] for name in "abc"]
     (dataset.root / "slat" / "a.npz").unlink()
     less = run("build-store", *words, "--out", out, "--decoys", "0", code=1).stdout
     assert "removed: 1 asset of the store that was there" in less and "changed" not in less
@@ -96,27 +89,24 @@ def test_parameters_and_code_that_touch_an_asset_redo_it(built, aligned, monkeyp
 
 
 def test_one_file_of_all_slats_may_grow(make_dataset, aligned, tmp_path):
-    dataset = make_dataset("a", "b")
-    dataset.write_grid("c", make_asset(2).grid)
-    file = tmp_path / "all.h5"
+    dataset, out = make_dataset("a", "b", "c"), tmp_path / "s.zarr"
 
-    def write(name: str, seed: int) -> None:
-        made = make_asset(seed)
-        with h5py.File(file, "a") as h5:
-            h5[f"{name}/coords"], h5[f"{name}/feats"] = made.coords, made.feats
+    def write(*ids: str) -> None:
+        with h5py.File(tmp_path / "all.h5", "a") as file:
+            for one in ids:
+                file[f"{one}/coords"] = dataset.assets[one].coords
+                file[f"{one}/feats"] = dataset.assets[one].feats
 
-    write("a", 0)
-    write("b", 1)
-    parameters = dataset.parameters(slat={"root": file})
-    build_store(parameters, tmp_path / "s.zarr")
-    assert len(aligned) == 2
-    write("c", 2)
+    write("a", "b")
+    parameters = dataset.parameters(slat={"root": tmp_path / "all.h5"})
+    build_store(parameters, out)
+    write("c")
     again = ("reuse", "unchanged, but for sources")
     new = ("align", "not in the store")
-    assert reasons(parameters, tmp_path / "s.zarr") == {"a": again, "b": again, "c": new}
-    build_store(parameters, tmp_path / "s.zarr")
-    assert len(aligned) == 3
-    assert tree(tmp_path / "s.zarr") == tree_from_nothing(parameters)
+    assert reasons(parameters, out) == {"a": again, "b": again, "c": new}
+    build_store(parameters, out)
+    assert aligned == ["a", "b", "c"]
+    assert tree(out) == tree_from_nothing(parameters)
 
 
 def test_fresh_does_everything(built, aligned):
@@ -159,8 +149,7 @@ def test_a_dry_run_looks_where_the_build_does(built, tmp_path):
     with pytest.raises(StoreError, match="expected --manifests FOLDER"):
         plan_build(dataset.parameters(), tmp_path / "s")
     own = tmp_path / "records"
-    plan = plan_build(dataset.parameters(), tmp_path / "s", manifests=own)
-    assert plan.actions["reuse"] == 3
+    assert plan_build(dataset.parameters(), tmp_path / "s", manifests=own).actions["reuse"] == 3
     sides = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
     words = ("build-store", *sides, "--out", tmp_path / "s", "--manifests", own, "--dry-run")
     assert "3 to reuse" in run(*words).output

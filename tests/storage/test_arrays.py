@@ -100,8 +100,7 @@ def objects(count: int, frame: int, spread: float, rng: random.Random) -> list[t
 
 def index(files: list[tuple[str, int]]) -> tuple[list[str], SparseArchive]:
     archive = SparseArchive(files)
-    ahead = ReadAhead(archive, remote=True)
-    found = entries(ahead, archive.size, needed=ARCHIVE.may_hold)
+    found = entries(ReadAhead(archive, remote=True), archive.size, needed=ARCHIVE.may_hold)
     return [entry.name for entry, _ in found if entry], archive
 
 

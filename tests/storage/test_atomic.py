@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from support.synthetic import Made
-from support.trees import tree
+from support.trees import copied, tree
 
 from slatprep import ConfigError, StoreError, build_store, subset_store
 from slatprep.pipeline.work import work_beside
@@ -231,17 +230,10 @@ def test_what_others_have_beside_a_store_is_refused_before_any_work(undisturbed,
     assert (folder / "assets-00001.jsonl").read_text() == '{"mine": 1}\n'
 
 
-def copied(undisturbed: Made, folder: Path, name: str) -> Path:
-    """Copy a store and its records, which call it ``s.zarr``, to another name."""
-    for suffix in (".zarr", ".manifests"):
-        shutil.copytree(undisturbed[1].with_suffix(suffix), folder / f"{name}{suffix}")
-    return folder / f"{name}.zarr"
-
-
 def test_two_stores_in_a_folder_do_not_share_records(undisturbed, tmp_path):
     """``s`` and ``s.zarr`` both have ``s.manifests`` by default."""
     parameters = undisturbed[0].parameters("pixie")
-    first, second = copied(undisturbed, tmp_path, "s"), tmp_path / "s"
+    first, second = copied(undisturbed[1], tmp_path / "s.zarr"), tmp_path / "s"
     records = (tmp_path / "s.manifests" / "build.json").read_bytes()
     told = r"s\.manifests: holds the records of .*s\.zarr; expected --manifests FOLDER"
     for named in (None, tmp_path / "s.manifests"):
@@ -260,9 +252,10 @@ def test_two_stores_in_a_folder_do_not_share_records(undisturbed, tmp_path):
 
 @pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside one of its old name"])
 def test_records_of_a_store_that_was_renamed_with_them_stay_its_own(undisturbed, tmp_path, beside):
-    renamed = copied(undisturbed, tmp_path, "new")
+    """They call it ``s.zarr``."""
+    renamed = copied(undisturbed[1], tmp_path / "new.zarr")
     if beside:
-        copied(undisturbed, tmp_path, "s")
+        copied(undisturbed[1], tmp_path / "s.zarr")
     build_store(undisturbed[0].parameters(), renamed)
     assert b'"new.zarr"' in (tmp_path / "new.manifests" / "build.json").read_bytes()
     assert not beside or b'"s.zarr"' in (tmp_path / "s.manifests" / "build.json").read_bytes()

@@ -164,8 +164,7 @@ def test_a_name_that_none_or_several_have_is_answered(made, name, hint):
 
 def test_assets_are_taken_by_number_id_beginning_and_slice(made):
     store, _ = made
-    names = (0, "0", np.int64(-4), "a", IDS[0])
-    assert {store[name].asset_id for name in names} == {IDS[0]}
+    assert {store[name].asset_id for name in (0, "0", np.int64(-4), "a", IDS[0])} == {IDS[0]}
     assert store[-1].asset_id == store.asset("3").asset_id == IDS[3]
     assert [asset.asset_id for asset in store[1:3]] == list(IDS[1:3])
     assert [asset.asset_id for asset in store[::-1]] == list(IDS[::-1])

@@ -30,8 +30,7 @@ def make(
 ) -> None:
     """Write an array by zarr alone, in shards of so many rows; chunks of fill values are none."""
     rest = values.shape[1:]
-    root = zarr.open_group(folder, mode="a", zarr_format=3)
-    array = root.create_array(
+    array = zarr.open_group(folder, mode="a", zarr_format=3).create_array(
         name,
         shape=values.shape,
         dtype=str if values.dtype.hasobject else values.dtype,
@@ -99,8 +98,7 @@ def test_a_chunk_that_was_never_written_holds_the_fill_value(tmp_path):
     values = np.arange(24, dtype=np.float32)
     values[3:9] = -2.5  # the second chunk of the first shard, and the first of the next
     make(tmp_path, "voxel/distance", values, 3, 6, -2.5)
-    index = index_of(tmp_path / "voxel/distance/c/0", 2)
-    assert index[1] == (NOT_THERE, NOT_THERE)
+    assert index_of(tmp_path / "voxel/distance/c/0", 2)[1] == (NOT_THERE, NOT_THERE)
     reader = reader_of(tmp_path, "voxel/distance")
     assert reader.read(0, 24).tolist() == values.tolist()
     assert reader.read(5, 10).tolist() == values[5:10].tolist()
@@ -307,22 +305,18 @@ def test_the_shards_read_last_stay_open_and_no_others(tmp_path):
 
 @pytest.mark.parametrize("index_bytes", [0, 68], ids=["with the index", "behind the index"])
 @pytest.mark.parametrize("prefetch_bytes", [0, 2**20])
-def test_what_cannot_be_read_names_its_file(shard, tmp_path, prefetch_bytes, index_bytes):
-    class Failing(LocalFile):
-        """A disk, or a server that cuts a body short: size answers, reading does not."""
+def test_what_cannot_be_read_is_named(shard, tmp_path, monkeypatch, prefetch_bytes, index_bytes):
+    """On a disk, or of a server that cuts a body short: size answers, reading does not."""
+    pread = LocalFile.pread
 
-        def pread(self, length: int, offset: int) -> bytes:
-            if offset < self.size() - index_bytes:
-                raise OSError(errno.EIO, "the disk gave up")
-            return super().pread(length, offset)
+    def failing(file: LocalFile, length: int, offset: int) -> bytes:
+        if offset < file.size() - index_bytes:
+            raise OSError(errno.EIO, "the disk gave up")
+        return pread(file, length, offset)
 
-    class Folder(LocalFolder):
-        def open(self, name: str) -> LocalFile:
-            return Failing(f"{self.path}/{name}")
-
-    folder = Folder(tmp_path)
-    folder.prefetch_bytes = prefetch_bytes
-    reader = reader_of(folder, "voxel/material")
+    monkeypatch.setattr(LocalFile, "pread", failing)
+    monkeypatch.setattr(LocalFolder, "prefetch_bytes", prefetch_bytes)
+    reader = reader_of(tmp_path, "voxel/material")
     what = r"voxel/material/c/0: cannot be read \(the disk gave up\)"
     with pytest.raises(StoreError, match=what):
         reader.read(0, 32)
@@ -335,10 +329,9 @@ def test_packed_chunks_are_the_bytes_of_the_files_a_few_at_a_time(tmp_path, monk
     make(tmp_path, "voxel/feats", values, 4, 40)  # 10 chunks of 400 bytes, and 8
     monkeypatch.setattr(shard_reader, "_COPIED_BYTES", 1000)
     reader = reader_of(LocalFolder(tmp_path), "voxel/feats")
-    files = [tmp_path / f"voxel/feats/c/{n}/0" for n in range(2)]
     chunks = [
         file.read_bytes()[offset : offset + length]
-        for file in files
+        for file in [tmp_path / f"voxel/feats/c/{n}/0" for n in range(2)]
         for offset, length in index_of(file, 10)
         if offset != NOT_THERE
     ]
@@ -347,15 +340,13 @@ def test_packed_chunks_are_the_bytes_of_the_files_a_few_at_a_time(tmp_path, monk
         found = []
         for data, lengths in reader.packed(first, last):
             assert len(data) == sum(lengths) < 1000 + 500
-            cuts = np.cumsum([0, *lengths]).tolist()
-            found += [data[a:b] for a, b in pairwise(cuts)]
+            found += [data[a:b] for a, b in pairwise(np.cumsum([0, *lengths]).tolist())]
         assert found == chunks[first:last]
 
 
 def test_packed_chunks_that_are_not_side_by_side_or_damaged_are_refused(tmp_path, shard):
     index, content = index_of(shard, 4), shard.read_bytes()
-    no_order = [index[0], index[2], index[1], index[3]]
-    write_index(shard, no_order)
+    write_index(shard, [index[0], index[2], index[1], index[3]])
     reader = reader_of(tmp_path, "voxel/material")
     (one,) = reader.packed(1, 2)
     assert one == (content[index[2][0] : sum(index[2])], [index[2][1]])

@@ -112,10 +112,9 @@ def test_shards_are_pieced_together_from_what_is_the_same(drawn, chunk, chunks):
     parameters = StoreParameters(
         voxel_chunk=chunk, voxel_chunks_per_shard=chunks, grid_assets_per_shard=1
     )
-    taken = {("voxel", 0)}
     cut = [
         shard
-        for shard in shards(["a"], [0, len(new)], parameters, {"voxel": runs}, taken)
+        for shard in shards(["a"], [0, len(new)], parameters, {"voxel": runs}, {("voxel", 0)})
         if shard.group == "voxel"
     ]
     assert [shard.start for shard in cut] == list(range(0, len(new), chunk * chunks))[1:]

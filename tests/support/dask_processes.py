@@ -101,11 +101,13 @@ class Processes:
         wait_until(lambda: file.exists() and file.read_text().endswith("}"))
         return str(json.loads(file.read_text())["address"])
 
-    def worker(self, address: str, *options: str, path: str = "") -> subprocess.Popen[bytes]:
+    def worker(
+        self, address: str, *options: str, path: str = "", **variables: str
+    ) -> subprocess.Popen[bytes]:
         """Start a worker of one thread, unless options say otherwise."""
         return self._start(
             "worker", address, "--nthreads", "1", "--no-dashboard",
-            "--local-directory", str(self.folder), *options, path=path,
+            "--local-directory", str(self.folder), *options, path=path, **variables,
         )  # fmt: skip
 
     def worker_elsewhere(
@@ -114,9 +116,8 @@ class Processes:
         """Start a worker that sees nothing of `root` but a disk of its own, and how to fail."""
         disk = self.folder.with_name(f"{self.folder.name}-disk-{len(self._started)}")
         disk.mkdir()
-        return self._start(
-            "worker", address, "--nthreads", "1", "--no-dashboard",
-            "--local-directory", str(disk), "--preload", str(self.folder / "private.py"),
+        return self.worker(
+            address, "--local-directory", str(disk), "--preload", str(self.folder / "private.py"),
             TMPDIR=str(disk), SLATPREP_CACHE=str(disk / "cache"),
             ONLY_SEES=os.pathsep.join(map(str, (root, disk, self.folder))), **variables,
         )  # fmt: skip

@@ -31,9 +31,7 @@ class PublishedHub(ThreadingHTTPServer):
         """Another server, to which whoever asks for a file is sent."""
         self.delay = 0.0
         self.requests: list[tuple[str, str]] = []
-        self.refusals: list[float] = []
         self.tokens: list[str] = []
-        self._last = 0.0
         self.bytes, self._lock = 0, threading.Lock()
         threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
 
@@ -51,12 +49,7 @@ class PublishedHub(ThreadingHTTPServer):
     def count(self, method: str, path: str, size: int) -> None:
         with self._lock:
             self.requests.append((method, path))
-            self._last = time.monotonic()
             self.bytes += size
-
-    def served(self) -> float:
-        """When the last request was answered."""
-        return self._last
 
     def ranges(self) -> int:
         """How many ranges of files were served."""
@@ -78,7 +71,6 @@ class _Handler(BaseHTTPRequestHandler):
             return self._error(401, "RepoNotFound", path)
         if hub.refused:
             hub.refused -= 1
-            hub.refusals.append(time.monotonic())
             return self._error(429, "", path, hub.wait)
         if parts[:2] == ["api", "datasets"]:
             return self._api("/".join(parts[2:4]), parts[4:], path)

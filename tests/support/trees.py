@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,12 @@ def tree(directory: Path | None) -> dict[str, str]:
         for path in directory.rglob("*")
         if path.is_file()
     }
+
+
+def copied(store: Path, to: Path) -> Path:
+    """Copy a store and its records: what is built on it need not be aligned again."""
+    shutil.copytree(store.with_suffix(".manifests"), to.with_suffix(".manifests"))
+    return Path(shutil.copytree(store, to))
 
 
 def inodes(directory: Path) -> dict[str, int]:

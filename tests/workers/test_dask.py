@@ -110,11 +110,9 @@ def test_an_asset_that_kills_every_worker_costs_itself_alone(shared, address, lo
 
 def test_the_other_commands_find_the_same(address, local, tmp_path):
     dataset, store = local
-    parameters = dataset.parameters("pixie")
-    damaged = tmp_path / "damaged.zarr"
+    parameters, damaged = dataset.parameters("pixie"), tmp_path / "damaged.zarr"
     shutil.copytree(store, damaged)
-    shard = max((damaged / "voxel" / "feats").rglob("*"), key=lambda path: path.stat().st_size)
-    flip(shard, 100)
+    flip(max((damaged / "voxel" / "feats").rglob("*"), key=lambda path: path.stat().st_size), 100)
     with Cluster(address) as cluster:
         aligned = align_pairs(parameters, tmp_path / "cluster.jsonl", jobs=cluster)
         plan = plan_build(parameters, store, jobs=cluster)
@@ -233,5 +231,4 @@ def test_the_first_worker_is_waited_for():
 
 def test_jobs_and_scheduler_exclude_each_other():
     options = ("--jobs", 2, "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr")
-    result = run("build-store", *options, code=2)
-    assert "--jobs is for this machine" in result.output
+    assert "--jobs is for this machine" in run("build-store", *options, code=2).output

@@ -83,8 +83,7 @@ def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_
     (faults / "held").unlink()
     assert current(s3, url) == tree(another[1])
     for step in ("store created", "manifests published"):
-        killed = build(f"if step == {step!r}:\n    kill_self()")
-        assert killed.wait(900) == -9, step
+        assert build(f"if step == {step!r}:\n    kill_self()").wait(900) == -9, step
         assert current(s3, url) == tree(another[1])
     assert len(spooled(s3, url)) == 3
     kills = [faults / f"kill at {step}" for step in ("shard filled", "shard written")]
@@ -99,8 +98,7 @@ def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_
     # No array was on the disk of the machine that ran the command; what it saw stays there.
     stay = [path.name for path in (tmp_path / "cache").rglob("*") if path.is_file()]
     assert stay == ["sources.seen"]
-    aligned = (faults / "aligned").read_text().split()
-    assert sorted(aligned) == ["a", "b", "c"]
+    assert sorted((faults / "aligned").read_text().split()) == ["a", "b", "c"]
 
 
 def spooled(s3: Any, url: str) -> list[str]:

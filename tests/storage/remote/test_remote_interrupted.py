@@ -70,8 +70,7 @@ def test_a_killed_build_leaves_a_whole_store(s3, url, undisturbed, another, faul
     assert current(s3, url) == tree(new if shown else old)
     there = len(contents(s3, f"{url}/versions"))
     requests.made.clear()
-    summary = build_store(dataset.parameters("pixie"), url)
-    assert summary.complete
+    assert build_store(dataset.parameters("pixie"), url).complete
     assert current(s3, url) == tree(new)
     # Nothing was uploaded twice, and nothing is left but the version before.
     uploaded = [key for key in requests.of("put_object") if "/versions/" in key]
@@ -188,9 +187,7 @@ def below(names: list[str], version: str) -> set[str]:
 
 
 @pytest.mark.usefixtures("files_are_old", "few_are_new")
-def test_the_server_copies_shards_and_what_is_gone_is_made(
-    s3, url, tmp_path, requests, monkeypatch
-):
+def test_the_server_copies_shards_and_what_is_gone_is_new(s3, url, tmp_path, requests, monkeypatch):
     dataset, beside = built(tmp_path, "a", "c", "e", "g")
     put(beside, url)  # As from another machine: nothing here knows of the sources' states.
     before = tree(beside)

@@ -48,21 +48,18 @@ def test_a_definition_may_name_urls(uploaded, s3, bucket, tmp_path):
 @pytest.mark.parametrize("place", ["s3://no-such-bucket/x", "s3://{bucket}/none"])
 def test_a_root_that_is_not_there_is_named(uploaded, bucket, place, tmp_path):
     place = place.format(bucket=bucket)
-    parameters = replace(uploaded, slat=SlatSource(place))
     with pytest.raises(ConfigError, match=f"^{place}: does not exist"):
-        build_store(parameters, tmp_path / "s.zarr")
+        build_store(replace(uploaded, slat=SlatSource(place)), tmp_path / "s.zarr")
     roots = {"pixieverse": {"root": str(uploaded.pixieverse.root)}, "slat": {"root": place}}
     with pytest.raises(ConfigError, match=f"slat.root: {place} does not exist"):
         load_parameters(None, roots)
 
 
 def test_torn_and_lost_objects_cost_their_assets_alone(uploaded, s3, bucket, tmp_path, monkeypatch):
-    torn = s3.cat_file(f"{bucket}/data/slat/b.npz")[:1000]
-    s3.pipe_file(f"{bucket}/data/slat/b.npz", torn)
+    s3.pipe_file(f"{bucket}/data/slat/b.npz", s3.cat_file(f"{bucket}/data/slat/b.npz")[:1000])
     grid = f"s3://{bucket}/data/pixieverse/c/sample_0/material_grid.npy"
     inject(monkeypatch, lambda step, name: (step, name) == ("asset begun", "c") and s3.rm(grid))
-    summary = build_store(uploaded, tmp_path / "s.zarr")
-    problems = dict(summary.problems)
+    problems = dict(build_store(uploaded, tmp_path / "s.zarr").problems)
     assert open_store(tmp_path / "s.zarr").ids == ["a"]
     assert f"s3://{bucket}/data/slat/b.npz: is no readable npz archive" in problems["b"]
     assert problems["c"].startswith(f"{grid}: does not exist")

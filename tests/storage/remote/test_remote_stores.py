@@ -92,8 +92,7 @@ def test_what_did_not_change_is_neither_aligned_nor_uploaded_again(s3, url, make
     build_store(dataset.parameters("pixie"), url)
     first = contents(s3, url)
     requests.made.clear()
-    summary = build_store(dataset.parameters("pixie"), url)
-    assert summary.statuses["ok"] == 2
+    assert build_store(dataset.parameters("pixie"), url).statuses["ok"] == 2
     assert requests.of("put_object") == []
     # All done again, from nothing, gives the same bytes, which are there already.
     build_store(dataset.parameters("pixie"), url, fresh=True)
@@ -311,8 +310,7 @@ def test_a_copy_is_made_once_and_no_name_leads_out(s3, url, undisturbed, request
 
 
 def test_a_copy_that_differs_from_what_was_published_is_none(s3, url, undisturbed, tmp_path):
-    version = put(undisturbed[1], url)
-    flip(s3, f"{version}/voxel/feats/c/0/0")
+    flip(s3, f"{put(undisturbed[1], url)}/voxel/feats/c/0/0")
     with pytest.raises(StoreError, match=r"copy is not what was published there.*slatprep verify"):
         open_store(url, copy=True)
     assert not list((tmp_path / "cache").rglob("zarr.json"))
@@ -354,8 +352,7 @@ def test_a_store_that_was_copied_there_as_it_is_can_be_read(s3, bucket, undistur
 
 
 def test_other_file_systems_of_fsspec_do_as_well(make_dataset, tmp_path):
-    dataset = make_dataset("a")
-    place = "memory://stores/demo.zarr"
+    dataset, place = make_dataset("a"), "memory://stores/demo.zarr"
     fsspec.filesystem("memory").rm("/", recursive=True)
     build_store(dataset.parameters("pixie"), place)
     dataset.add("b", seed=1)
