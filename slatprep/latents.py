@@ -11,6 +11,7 @@ from functools import cached_property
 from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.parameters import SlatSource
 from slatprep.readers import contents, discover_slats
+from slatprep.readers.plausible import ENOUGH
 from slatprep.readers.slat import checked_latents, read_slat
 from slatprep.records import LatentMoments, LatentSpace, Place, StructuredLatents
 from slatprep.store import open_store
@@ -78,7 +79,7 @@ class LatentsReader:
             return replace(latents, standardised=self.standardised == "yes")
         moments, path = latents.moments, latents.sources[0].path
         how = contents.in_words(moments)
-        enough = len(latents.coords) >= contents.ENOUGH
+        enough = len(latents.coords) >= ENOUGH
         if enough and not contents.tell_alone(moments, self.space):
             known = self._moments_of_files
             if len(known) < 2:

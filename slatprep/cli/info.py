@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -30,9 +31,10 @@ def info(output: Output, store: options.LastStore) -> None:
     """
     from slatprep.inspect.overview import overview_of
     from slatprep.pipeline.decoys import told_of
+    from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)
-    overview = overview_of(opened)
+    overview, unusual = overview_of(opened), stored_oddities(opened)
 
     def show() -> None:
         contents: dict[str, Cell] = {
@@ -49,6 +51,7 @@ def info(output: Output, store: options.LastStore) -> None:
         output.record(f"Store {overview.store}", contents)
         show_quality(output, overview)
         show_errors(opened)
+        show_unusual(unusual)
         output.table(
             f"Normalisation to [-1, 1] (ranges: {overview.normalization.source})",
             ("property", "scale", "lo", "hi"),
@@ -58,7 +61,7 @@ def info(output: Output, store: options.LastStore) -> None:
             ],
         )
 
-    output.result(vars(overview) | {"errors": told_of(opened)}, show)
+    output.result(vars(overview) | {"errors": told_of(opened), "unusual": unusual}, show)
 
 
 def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True) -> None:
@@ -102,6 +105,12 @@ def show_errors(store: Store) -> None:
 
     for sentence in told_of(store):
         say(f"errors:  {sentence}")
+
+
+def show_unusual(sentences: Iterable[str]) -> None:
+    """Print what is unusual of the sources of a store."""
+    for sentence in sentences:
+        say(f"unusual: {sentence}")
 
 
 def _source_of_categories(overview: StoreOverview) -> str:
@@ -151,9 +160,11 @@ def list_assets(
     """
     from slatprep.inspect.overview import list_assets as listed_of
     from slatprep.pipeline.decoys import measured_errors
+    from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)
     listed = list(listed_of(opened, *chosen.of(opened), max_confidence))
+    unusual = [] if ids else stored_oddities(opened)
 
     def show() -> None:
         if ids:
@@ -168,8 +179,9 @@ def list_assets(
         output.table(title, ("id", *columns, "why"), rows)
         if measured_errors(opened.path):
             show_errors(opened)
+        show_unusual(unusual)
 
-    output.result({"store": store, "assets": listed}, show)
+    output.result({"store": store, "assets": listed, "unusual": unusual}, show)
 
 
 def _in_short(reasons: tuple[str, ...]) -> str:

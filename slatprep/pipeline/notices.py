@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,15 @@ from slatprep.align.consensus import find_consensus
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.rows import NextStore, Row, moments_of
-from slatprep.readers.contents import ENOUGH, in_words, look_standardised, pooled_moments
+from slatprep.pipeline.rows import NextStore, moments_of
+from slatprep.readers.contents import in_words, look_standardised, pooled_moments
 from slatprep.readers.joins import explain_unmatched
+from slatprep.readers.plausible import ENOUGH, ODD, oddities_in
 from slatprep.readers.values import guess_in
 from slatprep.records import AssetPair, Normalization, Verdict
 from slatprep.store import Store
 from slatprep.store.record import FailedRecord
+from slatprep.store.records import StoredRecords
 
 # What the range would be without an asset: narrower by decades, or by its own widths.
 _WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0
@@ -58,7 +60,8 @@ def dataset_notices(
     yield from latent_warnings(new, parameters.slat.standardised)
     if not (parameters.consensus.settle or parameters.pixieverse.samples == "merge"):
         yield from shared_rotation(new)
-    yield from unusual_values(new.rows, failed)
+    made = {row.asset_id: row.columns["odd"] for row in new.rows if row.spooled}
+    yield from unusual_sources(made, len(made), failed)
     yield from shared_sources(new)
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
         yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
@@ -78,24 +81,36 @@ def much_clipped(store: Store) -> Iterator[str]:
             )
 
 
-def unusual_values(rows: Sequence[Row], failed: Sequence[FailedRecord] = ()) -> Iterator[str]:
-    """Yield once that values of new assets are unusual, and what refused ones look like.
+def unusual_sources(
+    odd: Mapping[str, Mapping[str, str]], among: int, failed: Sequence[FailedRecord] = ()
+) -> Iterator[str]:
+    """Yield once what is unusual, `odd`, of sources of assets, and what refused values look like.
 
     The records tell of each.
     """
-    made = [row for row in rows if row.spooled]
-    told = [(row.asset_id, str(row.columns["unusual"])) for row in made if row.columns["unusual"]]
-    if told:
-        refused = Counter(guess for one in failed if (guess := guess_in(one.reason)))
-        also = (
-            f"; {count} refused assets look like {unit}, and {'these' if told[1:] else 'this'} "
-            "probably too"
-            for unit, count in refused.most_common(1)
-        )
+    for kind in sorted({kind for own in odd.values() for kind in own}):
+        told = [(asset_id, own[kind]) for asset_id, own in odd.items() if kind in own]
+        also = ""
+        if kind == "values":
+            refused = Counter(guess for one in failed if (guess := guess_in(one.reason)))
+            for unit, count in refused.most_common(1):
+                these = "these" if told[1:] else "this"
+                also = f"; {count} refused assets look like {unit}, and {these} probably too"
         yield (
-            f"values of {len(told)} of {len(made)} assets are unusual "
-            f"({_first([name for name, _ in told])}): {told[0][1]}{''.join(also)}"
+            f"{kind} of {len(told):,} of {among:,} assets are unusual "
+            f"({_first([name for name, _ in told])}): {told[0][1]}{also}"
         )
+
+
+def stored_oddities(store: Store) -> list[str]:
+    """Say what is unusual of the sources of all assets of a store, by their records."""
+    records, odd = StoredRecords(store), {}
+    for row, asset_id in enumerate(store.ids):
+        # A record takes a hundred times as long to check as to search.
+        text = records.text(row)
+        if ODD in text[text.rfind('"warnings":') :]:
+            odd[asset_id] = oddities_in(records.read(row).warnings)
+    return list(unusual_sources(odd, len(store)))
 
 
 def shared_rotation(new: NextStore) -> Iterator[str]:

@@ -147,10 +147,10 @@ class Row:
 
     In the spool, `key` names its file, and `columns` has what its record says in ``asset/*`` by
     last name. There are also ``n_valid``; ``n_placements``, its distinct placements that fit about
-    as well; ``unusual``, what is unusual of its values; ``grid``, the digest of its grid. Otherwise
-    it is a `row` of one of the stores that rows are taken from, and `names` are those that its
-    record there has otherwise. `damaged` says why what an older store holds of it was not taken
-    over. `seen` is the state of its sources as they were read, empty where they were not.
+    as well; ``odd``, what is unusual of its sources by kind; ``grid``, the digest of its grid.
+    Otherwise it is a `row` of one of the stores that rows are taken from, and `names` are those
+    that its record there has otherwise. `damaged` says why what an older store holds of it was not
+    taken over. `seen` is the state of its sources as they were read, empty where they were not.
     """
 
     asset_id: str

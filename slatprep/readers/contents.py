@@ -16,6 +16,7 @@ from slatprep.errors import ConfigError
 from slatprep.parameters import BuildParameters, SlatSource
 from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, source_adapter
 from slatprep.readers.files import refusing
+from slatprep.readers.plausible import ENOUGH
 from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
 from slatprep.records.encoders import LATENTS
 from slatprep.storage.documents import adapter_of, read_document
@@ -73,9 +74,6 @@ def _disagreement(other: Holding, held: Holding) -> str:
 def _described(one: Property) -> str:
     return f"{one.name} in {one.unit}, {'log10' if one.log10 else 'linear'}"
 
-
-ENOUGH = 64
-"""Voxels below which the moments of latents say nothing of whether they are standardised."""
 
 _WIDE_ALONE = 1.2
 """Spread of the median channel above which one asset alone shows raw latents.

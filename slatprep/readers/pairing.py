@@ -242,7 +242,10 @@ def _pair_of(
             sample = grids[0].sample or source.sample
             known = {"id": row.object_id} | ({"sample": sample} if sample else {})
             if source.adapter == "pixieverse":
-                mask = _find_one(there, source.mask, known, "mask", problems)
+                # A mask of the grid's own name goes before one of all samples.
+                own = grids[0].path.replace("_pred.npy", "_mask.npy")
+                masks = sorted(source.mask, key=lambda pattern: fill(pattern, known) != own)
+                mask = _find_one(there, masks, known, "mask", problems)
                 bounds = _find_one(there, source.bounds, known, "bounds", problems)
             beside = tuple(there.roots.pixieverse / name for name in grids[0].beside)
             if source.transform:

@@ -18,6 +18,7 @@ from slatprep.geometry.voxels import voxels_at
 from slatprep.parameters import PixieverseSource, SampleParameters
 from slatprep.readers import files
 from slatprep.readers.adapters import Holding, SourceAdapter
+from slatprep.readers.plausible import told_of
 from slatprep.readers.values import require_plausible, require_possible, require_prediction
 from slatprep.readers.voxel_sets import physical, physical_rows
 from slatprep.records import (
@@ -39,6 +40,10 @@ _RAW_SHAPE = (*_CUBE, 4)
 GRID = files.ArraySpec((_RAW_SHAPE, (3 + len(MATERIAL_CLASSES), *_CUBE), (4, *_CUBE)), kinds="f")
 MASK = files.ArraySpec(shapes=(_CUBE,), kinds="bfiu")
 BOUND = files.ArraySpec(shapes=(), kinds="biufU")
+
+_DIFFERS, _CONTRADICTS = 0.05, 0.5
+"""Shares of a grid that a mask leaves out, or of a mask that is background, above which it is told,
+and a grid's above which mask and grid cannot be of one object."""
 
 UNLABELLED = -1
 """Class id of an occupied voxel that Pixie's labelling set aside."""
@@ -95,6 +100,8 @@ def read_grid(
     if not occupancy.any():
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
     annotated = _annotated(occupancy, material, path, warnings)
+    if pair.mask is not None:
+        warnings += _contradictions(pair.mask, occupancy, material, pair.roots.plausibility)
 
     cells = np.flatnonzero(annotated)
     voxels = voxels_at(cells)
@@ -187,6 +194,28 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
     if between:
         warnings.append(f"mask: {between} voxels lie between 0 and 1; above 0.5 is occupied")
     return mask
+
+
+def _contradictions(
+    path: Place, mask: NDArray[np.bool_], material: NDArray[np.int8], plausibility: str
+) -> list[str]:
+    """Hold a mask against the classes of its grid, and return what a person should know.
+
+    InputError where it leaves out most voxels with a class, unless `plausibility` lets them pass.
+    """
+    classified = material != BACKGROUND
+    left_out = 1 - float(mask[classified].mean())
+    empty = 1 - float(classified[mask].mean())
+    if plausibility == "off" or max(left_out, empty) <= _DIFFERS:
+        return []
+    fault = (
+        f"leaves out {left_out:.0%} of the voxels with a class, and {empty:.0%} of it is background"
+    )
+    if left_out > _CONTRADICTS and plausibility == "refuse":
+        expected = "the mask of this grid, in the same axes, or none: mask = [] in [pixieverse]"
+        raise InputError(path, fault, f'{expected}; or set plausibility = "warn" there')
+    way = "is it of this grid, and in the same axes? mask = [] in [pixieverse] reads none"
+    return [told_of("masks", f"{path.name} {fault}: {way}")]
 
 
 def _classes_of(

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
-from slatprep.readers.contents import ENOUGH, in_words, look_standardised
+from slatprep.readers.contents import in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays, load_group
+from slatprep.readers.plausible import ENOUGH, low_places, told_of
 from slatprep.records import RESOLUTION, TRELLIS, LatentSpace, Place, SourceFile, StructuredLatents
 from slatprep.storage.place import storage_of
 
@@ -45,6 +46,14 @@ def _textures_of(shapes: Place) -> Place:
 
 
 _COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
+
+_LARGEST = 1e4
+"""No encoder gives latents so large: theirs have a spread of some units."""
+
+_EXPECTED = f"finite latents that float32 can hold, within {_LARGEST:,.0f} of 0"
+
+_MANY_EMPTY = 0.05
+"""Share of rows of zeros, of which encoders give none."""
 
 
 def read_slat(
@@ -135,11 +144,8 @@ def checked_latents(
         sources,
         resolution=space.resolution,
     )
-    if len(coords) >= ENOUGH and latents.coords.max() < space.resolution // 2:
-        warnings.append(
-            f"no coordinate is above {latents.coords.max()}: if it lies on a grid of less than "
-            f"{space.resolution}^3, its places are wrong"
-        )
+    way = "name the encoder of a coarser grid as slat.encoder"
+    warnings += low_places(latents.coords, space.resolution, way)
     enough = len(coords) >= ENOUGH and not space.standardised
     if enough and look_standardised(latents.moments, space):
         warnings.append(
@@ -188,9 +194,22 @@ def _check_feats(
         warnings.append(f"feats: {feats.dtype.name} rounded to float32")
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
         latents = np.ascontiguousarray(feats, dtype=np.float32)
-    finite = np.isfinite(latents)
-    if not finite.all():
-        row, column = np.argwhere(~finite)[0].tolist()
+    fine = np.abs(latents) <= _LARGEST  # NaN is not
+    if not fine.all():
+        row, column = np.argwhere(~fine)[0].tolist()
         fault = f"feats is {feats[row, column]} in row {row}, channel {column}"
-        raise InputError(where, fault, "finite latents that float32 can hold")
+        raise InputError(where, fault, _EXPECTED)
+    if len(latents) < ENOUGH:
+        return latents
+    still, empty = (latents == latents[0]).all(axis=0), ~latents.any(axis=1)
+    if still.all():
+        fault = f"feats are the same in all {len(latents):,} rows"
+        raise InputError(where, fault, "latents that differ from voxel to voxel")
+    if still.any():
+        channels = ", ".join(map(str, np.flatnonzero(still)))
+        text = f"channel {channels} of feats is the same in all rows; encode the object again"
+        warnings.append(told_of("latents", text))
+    if empty.mean() > _MANY_EMPTY:
+        text = f"feats are 0 in {empty.mean():.0%} of the rows; encode the object again"
+        warnings.append(told_of("latents", text))
     return latents

@@ -12,6 +12,7 @@ from slatprep import records
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index, voxels_of
 from slatprep.normalize import from_mapped, to_mapped
+from slatprep.readers.plausible import low_places
 from slatprep.readers.values import require_plausible
 
 MAX_RESOLUTION = 512
@@ -45,8 +46,10 @@ def field_of_voxels(
     what becomes of implausible ones.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
-    count = len(cells)
+    count, whole = len(cells), np.asarray(voxels).dtype.kind != "f"
     notes: list[str] = []
+    if whole:
+        notes += low_places(cells, resolution, "say the grid's own resolution in source.json")
     given = np.zeros(count, np.int64) if material is None else np.asarray(material)
     with np.errstate(invalid="ignore"):
         own = given.astype(np.int64)
@@ -66,12 +69,14 @@ def field_of_voxels(
 
     keep = physical_rows(where, physical(values, table), table, told, max_unphysical, notes)
 
-    side = min(resolution, records.RESOLUTION)
+    side, index = min(resolution, records.RESOLUTION), cells
     if resolution > records.RESOLUTION:
         cells = (2 * cells + 1) * records.RESOLUTION // (2 * resolution)
     flat = flat_index(cells, side)
     cell, labels, means = _merged(flat[keep], own[keep], values[keep], table)
     if len(cell) < np.count_nonzero(keep):
+        if whole:
+            _require_alike(where, flat_index(index, resolution), own, values)
         notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(cell)} of {side}^3")
     there = np.full(side**3, -1, dtype=np.int64)
     there[flat] = len(cell)  # occupied at least
@@ -144,6 +149,23 @@ def physical_rows(
             raise InputError(where, fault, f"{table[column].allowed}, {most}")
         notes.append(f"{bad} voxels are unphysical, the first by {what}; not annotated")
     return keep
+
+
+def _require_alike(
+    where: str | records.Place,
+    flat: NDArray[np.int64],
+    classes: NDArray[np.int64],
+    values: NDArray[np.float32],
+) -> None:
+    """Refuse a voxel that is given twice, with other classes or values."""
+    order = np.argsort(flat, kind="stable")
+    twice = np.flatnonzero(np.diff(flat[order]) == 0)
+    first, second = order[twice], order[twice + 1]
+    other = (classes[first] != classes[second]) | (values[first] != values[second]).any(axis=1)
+    if other.any():
+        rows = f"rows {first[other][0]} and {second[other][0]}"
+        fault = f"{rows} are of one voxel, and differ in class or properties"
+        raise InputError(where, fault, "each voxel once; or points, as floats in the unit cube")
 
 
 def _merged(

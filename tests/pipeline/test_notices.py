@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import document, run
 from support.synthetic import Dataset, MakeDataset
 
 from slatprep import ConfigError, build_store
@@ -77,6 +78,28 @@ def test_unusual_values_are_told_with_what_refused_ones_look_like(dataset, tmp_p
     (text,) = [text for text in summary.warnings if "unusual" in text]
     assert text.startswith("values of 1 of 4 assets are unusual (c): its snow (40% of the voxels)")
     assert "; 2 refused assets look like MPa, and this probably too" in text
+
+
+def test_odd_sources_are_told_by_the_build_and_of_its_store(dataset, tmp_path):
+    occupied = {name: dataset.assets[name].grid[..., 3] != 7 for name in "bd"}
+    for name, mask in occupied.items():
+        path = dataset.root / "pixieverse" / name / "clip_features_mask.npy"
+        np.save(path, np.roll(mask, 3, axis=0))
+    asset = dataset.assets["c"]
+    still = np.column_stack([asset.feats[:, :7], np.ones(len(asset.feats), np.float32)])
+    dataset.write_slat("c.npz", asset.coords, still)
+    out = tmp_path / "s.zarr"
+    words = ("build-store", "--pixieverse", dataset.root / "pixieverse", "--slat",
+             dataset.root / "slat", "--out", out, "--decoys", "0")  # fmt: skip
+    masks = "masks of 2 of 6 assets are unusual (b, d): clip_features_mask.npy leaves out "
+    latents = "latents of 1 of 6 assets are unusual (c): channel 7 of feats is the same in all rows"
+    built = run(*words).stderr
+    assert masks in built and latents in built
+    assert "unusual" not in run(*words).stderr  # Nothing is new.
+    for command in ("info", "list"):
+        shown = run(command, out).stdout
+        assert f"unusual: {masks}" in shown and f"unusual: {latents}" in shown
+        assert [text[:6] for text in document(command, out)["unusual"]] == ["latent", "masks "]
 
 
 def test_one_asset_alone_does_not_tell_whether_it_is_standardised(make_dataset, tmp_path):

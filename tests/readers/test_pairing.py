@@ -85,10 +85,13 @@ def test_the_sample_is_chosen_whatever_the_adapter(find, tmp_path):
 def test_several_samples_by_number(find):
     numbers = (10, 0, 2)
     touched = [f"a/sample_{k}_{what}.npy" for k in numbers for what in ("pred", "mask")]
-    (pair,) = find(touched, ["a.npz"], pixieverse={"samples": "first"})
+    touched += ["a/clip_features_mask.npy", grid("b"), "b/sample_0_mask.npy"]
+    touched += ["b/clip_features_mask.npy"]
+    pair, raw = find(touched, ["a.npz", "b.npz"], pixieverse={"samples": "first"})
     assert (pair.problem, pair.sample, pair.others) == ("", "0", ())
+    assert raw.mask.name == "clip_features_mask.npy"  # The other is of a prediction.
 
-    (pair,) = find(pixieverse={"samples": "merge"})
+    pair, _ = find(pixieverse={"samples": "merge"})
     assert [one.sample for one in pair.annotations] == ["0", "2", "10"]
     for one in pair.annotations:
         assert (one.problem, one.asset_id) == ("", "a")

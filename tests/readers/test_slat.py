@@ -130,6 +130,47 @@ def test_bad_arrays(make_pair, arrays, what, expected):
         assert expected in caught.value.expected
 
 
+def cloud(side: int = 64, count: int = 200) -> dict[str, np.ndarray]:
+    """Return a SLAT of voxels anywhere on a grid, with latents as TRELLIS's."""
+    rng = np.random.default_rng(side)
+    cells = np.sort(rng.choice(side**3, count, replace=False))
+    coords = np.stack(np.unravel_index(cells, (side,) * 3), axis=1).astype(np.uint8)
+    return {"coords": coords, "feats": rng.normal(FEATS_MEAN, FEATS_STD, (count, 8)).astype("f4")}
+
+
+def test_coordinates_of_a_grid_of_half_the_side_are_told(make_pair):
+    (told,) = read_latents(make_pair(**cloud(32))).warnings
+    assert told.startswith(
+        "plausibility of places: no coordinate is above 31, as on a grid of 32^3"
+    )
+    assert "slat.encoder" in told
+    assert read_latents(make_pair(**cloud(64))).warnings == ()
+    assert read_latents(make_pair(**cloud(32, count=20))).warnings == ()
+
+
+def test_latents_that_no_encoder_gives_are_refused_or_told(make_pair):
+    whole = cloud()
+    feats = whole["feats"]
+    for wrong, said in (
+        (0 * feats, "feats are the same in all 200 rows; expected latents that differ"),
+        (0 * feats + feats[0], "feats are the same in all 200 rows"),
+        (
+            changed(feats, ((5, 2), 2.0**100)),
+            r"feats is 1\.26\S*e\+30 in row 5, channel 2; .*within 10,000 of 0",
+        ),
+        (changed(feats, ((5, 2), -65504)), r"feats is -65504\.0 in row 5, channel 2"),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_latents(make_pair(**whole | {"feats": wrong}))
+    for odd, said in (
+        (changed(feats, (np.s_[:, [2, 7]], 1.5)), "channel 2, 7 of feats is the same in all rows"),
+        (changed(feats, (np.s_[:30], 0)), "feats are 0 in 15% of the rows"),
+    ):
+        (told,) = read_latents(make_pair(**whole | {"feats": odd})).warnings
+        assert told.startswith(f"plausibility of latents: {said}")
+    assert read_latents(make_pair(**whole | {"feats": changed(feats, (3, 0))})).warnings == ()
+
+
 def test_missing_array_and_group(make_pair):
     pair = make_pair()
     for missing, arrays in (("feats", {"coords": COORDS}), ("coords", {"feats": FEATS})):

@@ -108,6 +108,34 @@ def test_a_grid_of_128_may_be_fuller_than_all_of_64(root):
     np.testing.assert_array_equal(field_at(root).voxels, np.unique(rows["voxels"] // 2, axis=0))
 
 
+def test_a_voxel_that_is_given_twice_is_refused_where_the_rows_differ(root):
+    rows = {name: column[:80] for name, column in rows_of(80).items()}
+    again = {name: np.concatenate([column, column[:1]]) for name, column in rows.items()}
+    write_voxels(root, "a", "npz", again)
+    assert len(field_at(root).voxels) == 80
+    for name, other in (("density", 5000.0), ("material", 2 - rows["material"][0] % 2)):
+        changed = again | {name: again[name].copy()}
+        changed[name][-1] = other
+        write_voxels(root, "a", "npz", changed)
+        with pytest.raises(InputError, match=r"rows 0 and 80 are of one voxel, and differ"):
+            field_at(root)
+    # Of points a cell may hold several.
+    points = changed | {"voxels": ((changed["voxels"] + 0.5) / 64 - 0.5).astype(np.float32)}
+    write_voxels(root, "a", "npz", points)
+    assert len(field_at(root).voxels) == 80
+
+
+def test_a_resolution_that_is_not_the_voxels_own_is_told(root):
+    write_description(root, TABLE, CLASSES, resolution=128)
+    for side, tells in ((64, 1), (128, 0)):
+        write_voxels(root, "a", "npz", rows_of(300, side))
+        told = [text for text in field_at(root).warnings if "plausibility of places" in text]
+        assert len(told) == tells
+    write_voxels(root, "a", "npz", rows_of(300))
+    (told, *_) = field_at(root).warnings
+    assert "as on a grid of 64^3, and 128^3 is read" in told and "source.json" in told
+
+
 def test_rows_and_voxels_of_physxnet_belong_together(tmp_path):
     rows, root = rows_of(500), tmp_path / "physx"
     write_physxnet(root, "a", rows["voxels"], rows["density"])
@@ -134,8 +162,9 @@ def test_rows_and_voxels_of_physxnet_belong_together(tmp_path):
     ],
 )
 def test_descriptions_that_no_store_can_follow_are_refused(root, classes, said):
-    edit_json(root / "source.json", lambda about: about.update(classes=classes))
-    if classes is None:
+    if classes is not None:
+        edit_json(root / "source.json", lambda about: about.update(classes=classes))
+    else:
         twice = '{"aligned": true, "aligned": false, '
         (root / "source.json").write_text((root / "source.json").read_text().replace("{", twice, 1))
     write_voxels(root, "a", "npz", rows_of(10))
