@@ -21,11 +21,11 @@ from slatprep.storage import atomic
 
 
 @pytest.fixture
-def reference(undisturbed: Made, tmp_path: Path) -> tuple[Dataset, dict[str, str]]:
-    """Three assets that may be changed, and the hashes of what is to come of them."""
+def reference(undisturbed: Made, tmp_path: Path) -> tuple[Dataset, Path, dict[str, str]]:
+    """Three assets that may be changed, where to build, and the hashes of what is to come."""
     dataset, store = undisturbed
     shutil.copytree(dataset.root, tmp_path / "sources")
-    return Dataset(tmp_path / "sources", dataset.assets), tree(store)
+    return Dataset(tmp_path / "sources", dataset.assets), tmp_path / "s.zarr", tree(store)
 
 
 @pytest.fixture(scope="module")
@@ -51,9 +51,8 @@ def ends_well(dataset: Dataset, out: Path, expected: dict[str, str]) -> None:
     ("asset begun", 2), ("shard begun", 3), ("directory flushed", 0), ("directory exchanged", 0),
     ("store replaced", 0), ("manifests written", 0),
 ])  # fmt: skip
-def test_killed_at_every_step(reference, old_store, tmp_path, step, calls):
-    dataset, expected = reference
-    out = tmp_path / "s.zarr"
+def test_killed_at_every_step(reference, old_store, step, calls):
+    dataset, out, expected = reference
     shutil.copytree(old_store, out)
     before = tree(out)
 
@@ -64,22 +63,21 @@ def test_killed_at_every_step(reference, old_store, tmp_path, step, calls):
 
 
 def test_what_was_finished_is_not_done_again(reference, tmp_path):
-    dataset, expected = reference
-    killed = Build(dataset, tmp_path / "s.zarr", kill_at("asset begun", 2)).done()
+    dataset, out, expected = reference
+    killed = Build(dataset, out, kill_at("asset begun", 2)).done()
     assert killed.returncode == -signal.SIGKILL
     # A torn file, as a power failure leaves it, is known and done again.
     torn, *_ = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.arrays"))
     torn.write_bytes(torn.read_bytes()[:-2000])
     # One was finished, so two alignments are enough.
-    again = Build(dataset, tmp_path / "s.zarr", kill_at("asset aligned", 2)).done()
+    again = Build(dataset, out, kill_at("asset aligned", 2)).done()
     assert again.returncode == 0, again.stderr
-    assert tree(tmp_path / "s.zarr") == expected
+    assert tree(out) == expected
 
 
 def test_a_kill_between_two_renames_is_mended(reference, tmp_path):
     """Where directories cannot be exchanged, there is a moment without a store."""
-    dataset, expected = reference
-    out = tmp_path / "s.zarr"
+    dataset, out, expected = reference
     build_store(dataset.parameters("pixie"), out)
     work = tmp_path / ".s.zarr.work"
     (work / "build-x").mkdir(parents=True)
@@ -92,8 +90,7 @@ def test_a_kill_between_two_renames_is_mended(reference, tmp_path):
 
 def test_workers_that_die_cost_nothing_and_an_asset_that_kills_each_is_named(reference, tmp_path):
     """One dies at asset b, another one at a shard, and whichever gets asset c."""
-    dataset, expected = reference
-    out, died = tmp_path / "s.zarr", tmp_path / "died"
+    (dataset, out, expected), died = reference, tmp_path / "died"
     died.mkdir()
     fault = f"""
 mark = os.path.join({str(died)!r}, step)
@@ -115,8 +112,8 @@ if (step, name) == ("asset begun", "c"):
     ends_well(dataset, out, expected)
 
 
-def test_memory_that_runs_out_is_told_of_the_asset(reference, tmp_path):
-    dataset, expected = reference
+def test_memory_that_runs_out_is_told_of_the_asset(reference):
+    dataset, out, expected = reference
     fault = """
 import numpy, resource
 if (step, name) == ("asset read", "b"):
@@ -128,18 +125,17 @@ if (step, name) == ("asset read", "b"):
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
 """
-    done = Build(dataset, tmp_path / "s.zarr", fault).done()
+    done = Build(dataset, out, fault).done()
     assert done.returncode == 0, done.stderr
     _, problems = json.loads(done.stdout)
     assert problems["b"].startswith("memory ran out")
-    ends_well(dataset, tmp_path / "s.zarr", expected)
+    ends_well(dataset, out, expected)
 
 
 @pytest.mark.parametrize("step", ["asset aligned", "shard begun"])
-def test_a_disk_that_takes_no_more(reference, tmp_path, step):
+def test_a_disk_that_takes_no_more(reference, step):
     """A limit on the size of files stands in for a full disk: the same error at a write."""
-    dataset, expected = reference
-    out = tmp_path / "s.zarr"
+    dataset, out, expected = reference
     fault = f"""
 import resource
 if step == {step!r}:
@@ -154,15 +150,15 @@ if step == {step!r}:
 
 
 def test_a_source_that_vanishes_midway(reference, tmp_path, monkeypatch):
-    dataset, expected = reference
+    dataset, out, expected = reference
     slat, kept = dataset.root / "slat" / "b.npz", tmp_path / "b.npz"
     with monkeypatch.context() as context:
         inject(context, lambda *at: at == ("asset begun", "b") and slat.rename(kept))
-        summary = build_store(dataset.parameters("pixie"), tmp_path / "s.zarr")
+        summary = build_store(dataset.parameters("pixie"), out)
     assert summary.statuses == {"ok": 2, "failed": 1, "skipped": 0}
     assert "b.npz: does not exist" in dict(summary.problems)["b"]
     kept.rename(slat)
-    ends_well(dataset, tmp_path / "s.zarr", expected)
+    ends_well(dataset, out, expected)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +169,7 @@ def test_a_source_that_vanishes_midway(reference, tmp_path, monkeypatch):
     ],
 )
 def test_a_target_that_permissions_keep(reference, tmp_path, mode, told):
-    dataset, expected = reference
+    dataset, _, expected = reference
     folder = tmp_path / "locked"
     folder.mkdir()
     folder.chmod(mode)
@@ -185,8 +181,7 @@ def test_a_target_that_permissions_keep(reference, tmp_path, mode, told):
 
 
 def test_the_second_of_two_builds_is_refused_and_told_of_the_first(reference, tmp_path):
-    dataset, expected = reference
-    out = tmp_path / "s.zarr"
+    dataset, out, expected = reference
     sleeping = """
 if step == "store created":
     time.sleep(600)
@@ -205,7 +200,7 @@ if step == "store created":
 
 
 def test_workers_do_not_outlive_a_killed_build(reference, tmp_path):
-    dataset, _ = reference
+    dataset, out, _ = reference
     pids = tmp_path / "pids"
     pids.mkdir()
     endless = f"""
@@ -213,17 +208,16 @@ if step == "asset begun":
     open(f"{pids}/{{os.getpid()}}", "w").close()
     time.sleep(600)
 """
-    build = Build(dataset, tmp_path / "s.zarr", endless, jobs=2)
+    build = Build(dataset, out, endless, jobs=2)
     wait_until(lambda: len(list(pids.iterdir())) == 2)
     build.kill()
     workers = [Path("/proc", path.name) for path in pids.iterdir()]
     wait_until(lambda: not any(worker.exists() for worker in workers))
 
 
-def test_a_few_kills_at_random_times(reference, tmp_path):
+def test_a_few_kills_at_random_times(reference):
     """The short version of ``benchmarks/soak_kills.py``."""
-    dataset, expected = reference
-    out = tmp_path / "s.zarr"
+    dataset, out, expected = reference
     build_store(dataset.parameters("pixie"), out)
     chance = random.Random(0)
     for turn in range(4):

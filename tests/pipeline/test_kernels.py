@@ -27,14 +27,6 @@ from slatprep.parameters.files import load_parameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.pipeline.asset import compile_kernels
 
-compiled = []
-
-class Listener(event.Listener):
-    def on_start(self, event):
-        compiled.append(event.data["dispatcher"].py_func.__qualname__)
-    def on_end(self, event):
-        pass
-
 def ready():
     kernels = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
     ours = [one for one in kernels if one.py_func.__module__.startswith("slatprep.")]
@@ -45,20 +37,21 @@ notes = []
 kept, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(root / "nothing compiled")
 _flood.enable_caching()
 numba.config.CACHE_DIR = kept
-with event.install_listener("numba:compile", Listener()):
+with event.install_recorder("numba:compile") as recorder:
     compile_kernels(notes.append)
+    compiled = {one.data["dispatcher"].py_func.__qualname__ for _, one in recorder.buffer}
     assert "_flood" in compiled and len(notes) == 2, (compiled, notes)
     assert re.search(r"about \d+ s", notes[0]) and notes[1].startswith("compiled in "), notes
     compile_kernels(notes.append)
     assert len(notes) == 2, notes
-    del compiled[:]
+    recorder.buffer.clear()
     before = ready()
     assert len(before) > 10, before
     make_demo(root / "demo", 8, 3, levels=(0, 1, 2, 3, 4, 5, 6, 7))
     build_store(load_parameters(root / "demo" / "dataset.toml"), root / "s.zarr")
     sources = PixieverseSource(root / "few" / "pixieverse"), SlatSource(root / "few" / "slat")
     build_store(BuildParameters(*sources), root / "few.zarr")
-    assert not compiled, compiled
+    assert not recorder.buffer, recorder.buffer
     assert ready() == before, ready() ^ before
 """
 
