@@ -10,7 +10,7 @@ VENV   ?= .venv
 unexport PYTHONDONTWRITEBYTECODE
 # OMP_NUM_THREADS would lower what nproc says; it means threads, not processes.
 JOBS   ?= $(shell env -u OMP_NUM_THREADS nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)
-DATA   ?= definitions/demo.toml
+DATA   ?= manifests/demo.toml
 ASSETS ?= 25
 SEED   ?= 0
 PRESET ?= default
@@ -27,7 +27,7 @@ help:
 	@echo "slatprep: aligned, normalised physics supervision for TRELLIS latents"
 	@echo
 	@echo "  make align            make demo data, align it, build the store, say how good it is"
-	@echo "  make align DATA=FILE  the same on your own data (see definitions/mine.example.toml)"
+	@echo "  make align DATA=FILE  the same on your own data (see manifests/mine.example.toml)"
 	@echo "  make test             linters, type checker, documentation, wheel and tests"
 	@echo "  make lint             linters and type checker alone"
 	@echo "  make bench            every measurement that the documentation quotes, onto docs/benchmarks.md"
@@ -55,7 +55,7 @@ INSTALLED := $(VENV)/.installed$(if $(filter paper,$(PRESET)),-paper)
 HUB := $(if $(wildcard $(DATA)),$(shell grep -l '^root *= *"hf://' $(DATA)))
 
 # A file that could not be used fails `make` in the end, but not before the page is drawn.
-ifeq ($(DATA),definitions/demo.toml)
+ifeq ($(DATA),manifests/demo.toml)
 align: $(INSTALLED) $(DEMO)/.assets-$(ASSETS)-seed-$(SEED)
 else
 align: $(INSTALLED) $(if $(HUB),$(VENV)/.installed-hub)
@@ -64,7 +64,7 @@ endif
 	$(BIN)/slatprep build-store --config $(DATA) --out $(STORE) --manifests $(MANIFESTS) \
 	    --jobs $(JOBS) $(if $(filter-out default,$(PRESET)),--preset $(PRESET)) || status=$$?; \
 	[ $$status -le 1 ] && [ -e $(STORE) ] || exit $$status; \
-	$(if $(filter definitions/demo.toml,$(DATA)),$(BIN)/slatprep score $(STORE) $(DEMO)/truth;) \
+	$(if $(filter manifests/demo.toml,$(DATA)),$(BIN)/slatprep score $(STORE) $(DEMO)/truth;) \
 	$(BIN)/slatprep report $(STORE) --manifests $(MANIFESTS) --out data/$(NAME).html; \
 	echo "results: $(STORE) (the store), $(MANIFESTS) (a record of every asset)"; \
 	echo "look:    open data/$(NAME).html in a browser"; \

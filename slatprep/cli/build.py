@@ -173,10 +173,10 @@ def build_store(
     Example
     -------
     slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr --jobs 2
-    slatprep build-store --config definitions/demo.toml --preset paper --out data/demo.zarr
+    slatprep build-store --config manifests/demo.toml --preset paper --out data/demo.zarr
     slatprep build-store --config demo/dataset.toml --ranges p1-p99 --ranges-of train --out d.zarr
-    slatprep build-store --config definitions/demo.toml --out data/demo.zarr --dry-run
-    slatprep build-store --config definitions/demo.toml --out data/demo.zarr --scheduler tcp://node7:8786
+    slatprep build-store --config manifests/demo.toml --out data/demo.zarr --dry-run
+    slatprep build-store --config manifests/demo.toml --out data/demo.zarr --scheduler tcp://node7:8786
     """
     parameters = sources.parameters(consensus=consensus, witness=witness)
     from slatprep.pipeline import dataset as build

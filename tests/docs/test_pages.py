@@ -179,7 +179,7 @@ def test_asset_ids_complete_from_the_store(mixed_build, monkeypatch):
     assert complete("slatprep export no.zarr --asset b").strip() == ""
 
 
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("definitions/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("manifests/*.md")])
 
 
 def code_lines(language: str) -> list[tuple[str, str]]:
