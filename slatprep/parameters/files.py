@@ -28,7 +28,7 @@ from slatprep.parameters import (
     is_split_file,
     percentiles_of,
 )
-from slatprep.storage.documents import adapter_of
+from slatprep.storage.documents import read_as
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -134,12 +134,11 @@ def _validated(kind: type[_Group], data: Mapping[str, Any], origin: _Origin) -> 
     # for a path as TOML has them, and still refuses "3" and true for 3.0.
     document = json.dumps(data, default=_plain)
     try:
-        parameters: _Group = adapter_of(kind).validate_json(document, strict=True)  # type: ignore[arg-type]
+        return read_as(kind, document)
     except ValidationError as error:
         # One line, one repair: a misspelt key first, because it makes another one missing.
         faults = sorted(error.errors(), key=lambda fault: fault["type"] != _UNKNOWN_KEY)
         raise ConfigError(_explain(faults[0], origin)) from None
-    return parameters
 
 
 def _plain(value: object) -> object:

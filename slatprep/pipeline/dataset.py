@@ -53,14 +53,7 @@ from slatprep.store.record_json import build_id_of, digest_of, to_json
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered, start_early
 
-__all__ = [
-    "BuildPlan",
-    "BuildSummary",
-    "Progress",
-    "align_pairs",
-    "build_store",
-    "plan_build",
-]
+__all__ = ["BuildPlan", "BuildSummary", "Progress", "align_pairs", "build_store", "plan_build"]
 
 
 def build_store(
@@ -193,10 +186,7 @@ def _finish_all(
 
 
 def finish(
-    pairs: Sequence[AssetPair],
-    plan: Mapping[str, PlannedAsset],
-    context: BuildContext,
-    crew: Crew,
+    pairs: Sequence[AssetPair], plan: Mapping[str, PlannedAsset], context: BuildContext, crew: Crew
 ) -> list[Row | FailedRecord]:
     """Bring assets into the spool; return what is kept of each, in no order.
 

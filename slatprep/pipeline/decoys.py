@@ -24,7 +24,7 @@ from slatprep.pipeline.publish import is_marked
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Engine, Number, Place, Share, Verdict
 from slatprep.storage.atomic import writing
-from slatprep.storage.documents import adapter_of, read_bounded
+from slatprep.storage.documents import read_as, read_bounded
 from slatprep.storage.place import storage_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_beside
@@ -387,10 +387,9 @@ def measured_errors(store: Place) -> MeasuredErrors | None:
     """Return what was measured of a store, or of what it was before an update; None if nothing."""
     try:
         text = read_bounded(file_of(store), _MAX_BYTES)
-        found: MeasuredErrors = adapter_of(MeasuredErrors).validate_json(text, strict=True)
+        return read_as(MeasuredErrors, text)
     except (OSError, ValueError):
         return None  # They are measured anew.
-    return found
 
 
 def told_of(store: Store) -> list[str]:

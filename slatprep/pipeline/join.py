@@ -25,7 +25,7 @@ from slatprep.pipeline.rows import NextStore, Row, SourceStore, in_order
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside
 from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange, words_of
-from slatprep.storage.documents import adapter_of
+from slatprep.storage.documents import read_as
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
 from slatprep.store import Store, open_store
@@ -220,15 +220,12 @@ def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildP
             places[side] = {"root": APART.join(dict.fromkeys(roots))}
     document = {"name": build["name"], **places, **build["parameters"]}
     try:
-        parameters: BuildParameters = adapter_of(BuildParameters).validate_json(
-            orjson.dumps(document), strict=True
-        )
+        return read_as(BuildParameters, orjson.dumps(document))
     except ValueError as error:
         path = sources[0].path
         raise StoreError(
             f"{path}: its attribute build does not say how it was built ({error}); build it again"
         ) from None
-    return parameters
 
 
 def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:

@@ -74,11 +74,7 @@ def pack_store(
 
 
 def _made(
-    path: Path,
-    new: NextStore,
-    work: Work,
-    jobs: Jobs,
-    progress: Callable[[int, int], None] | None,
+    path: Path, new: NextStore, work: Work, jobs: Jobs, progress: Callable[[int, int], None] | None
 ) -> tuple[Staged, frozenset[int]]:
     """Make a store; return what of it is not at `path`, and its shards of records taken over.
 

@@ -394,10 +394,7 @@ def _is_there(folder: Place, wanted: BuildRecord) -> bool:
 
 
 def build_record(
-    store: Store,
-    summary: BuildSummary,
-    parameters: BuildParameters,
-    failed: Iterable[FailedRecord],
+    store: Store, summary: BuildSummary, parameters: BuildParameters, failed: Iterable[FailedRecord]
 ) -> BuildRecord:
     """Return the record of a build that made a store."""
     voxels = summary.n_voxels, summary.n_valid, dict(summary.clipped), summary.n_unphysical

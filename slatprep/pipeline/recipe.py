@@ -28,14 +28,7 @@ from slatprep.pipeline.fingerprint import code_fingerprint, packing_fingerprint
 from slatprep.readers import contents_of, source_digests
 from slatprep.readers.ranges import pixie_ranges, read_ranges
 from slatprep.readers.splits import read_id_file
-from slatprep.records import (
-    AssetPair,
-    Contents,
-    Finished,
-    Normalization,
-    SourceFile,
-    Status,
-)
+from slatprep.records import AssetPair, Contents, Finished, Normalization, SourceFile, Status
 from slatprep.storage.place import place_of
 from slatprep.store import Store
 from slatprep.store.record import (

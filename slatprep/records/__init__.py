@@ -34,14 +34,7 @@ from slatprep.records.alignment import (
     Placement,
     Quality,
 )
-from slatprep.records.json_types import (
-    Count,
-    Digest,
-    InJson,
-    Number,
-    Share,
-    one_of,
-)
+from slatprep.records.json_types import Count, Digest, InJson, Number, Share, one_of
 from slatprep.records.sources import (
     FACTORS,
     LATENT_ROLES,

@@ -80,3 +80,9 @@ def adapter_of(kind: Any) -> TypeAdapter[Any]:
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
+
+
+def read_as(kind: type[_Value], text: bytes | str) -> _Value:
+    """Read a record of a kind from its JSON; pydantic's ValidationError, a ValueError, if none."""
+    read: _Value = adapter_of(kind).validate_json(text, strict=True)  # type: ignore[arg-type]
+    return read

@@ -6,14 +6,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar
 
 import orjson
 from annotated_types import MaxLen, MinLen
 
 from slatprep import records
 from slatprep.parameters import Length, SampleParameters
-from slatprep.storage.documents import adapter_of
+from slatprep.storage.documents import read_as
 from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT, FORMAT_VERSION
 from slatprep.store.record_json import faults_in
@@ -116,8 +116,7 @@ def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Fin
     from pydantic import ValidationError
 
     try:
-        read = adapter_of(RootAttributes).validate_json(orjson.dumps(attributes), strict=True)
-        return cast(RootAttributes, read)
+        return read_as(RootAttributes, orjson.dumps(attributes))
     except ValidationError as error:
         start = re.compile("Input should be |Value error, ")
         return tuple(

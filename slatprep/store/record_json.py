@@ -16,7 +16,7 @@ import orjson
 
 from slatprep.errors import StoreError
 from slatprep.records import SourceFile
-from slatprep.storage.documents import adapter_of
+from slatprep.storage.documents import read_as
 from slatprep.storage.place import is_place
 from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES
 from slatprep.store.record import AssetRecord, BuildRecord, Record
@@ -102,14 +102,13 @@ def _read(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
     from pydantic import ValidationError
 
     try:
-        read: _Kind = adapter_of(kind).validate_json(text, strict=True)  # type: ignore[arg-type]
+        return read_as(kind, text)
     except ValidationError as error:
         found = [
             f"{place or 'it'}: {message}{value and f', found {value}'}"
             for place, message, value in faults_in(error)
         ]
         raise RecordError(where, tuple(found)) from None
-    return read
 
 
 def faults_in(error: ValidationError) -> Iterator[tuple[str, str, str]]:

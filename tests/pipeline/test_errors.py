@@ -158,6 +158,19 @@ def test_a_decoy_not_aligned_costs_no_build(make_dataset, tmp_path, monkeypatch,
     assert said in summary.warnings[-1] and "replaced" not in summary.warnings[-1]
 
 
+@pytest.mark.usefixtures("few_suffice")
+def test_a_fault_of_slatprep_s_own_is_raised_though_the_store_is_there(
+    make_dataset, tmp_path, monkeypatch
+):
+    def faulty(*task: object) -> None:
+        raise TypeError("not callable")
+
+    monkeypatch.setattr(decoys, "align_decoy", faulty)
+    with pytest.raises(TypeError):
+        build_store(make_dataset(*OBJECTS).parameters(), tmp_path / "s.zarr")
+    assert len(open_store(tmp_path / "s.zarr")) == len(OBJECTS)
+
+
 @pytest.mark.usefixtures("few_suffice", "few_are_new")
 def test_a_small_update_measures_nothing_and_a_larger_one_takes_decoys_over(make_dataset, tmp_path):
     out, dataset = tmp_path / "s.zarr", make_dataset(*OBJECTS)
