@@ -40,7 +40,8 @@ from slatprep.pipeline import annotate, publish
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
-from slatprep.store.writer import create_store, open_for_writing
+from slatprep.store.integrity import open_for_writing
+from slatprep.store.writer import create_store
 
 STEPS = {
     "read_field": process,

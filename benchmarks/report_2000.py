@@ -27,9 +27,10 @@ import numpy as np
 from slatprep.inspect.report import write_report
 from slatprep.parameters import StoreParameters
 from slatprep.store import open_store
+from slatprep.store.integrity import open_for_writing
 from slatprep.store.layout import ARRAYS, RECORD_ARRAY
 from slatprep.store.records import manifests_of
-from slatprep.store.writer import create_store, open_for_writing
+from slatprep.store.writer import create_store
 
 RUNS = 3
 

@@ -47,7 +47,6 @@ from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Place
 from slatprep.storage.atomic import staged, writing
-from slatprep.store import open_store
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
 from slatprep.workers import Progress
@@ -162,7 +161,7 @@ def build_store(
         if records is not None:
             aligned = sum(plan[one].action is not Action.REUSE for one in new.ids)
             try:
-                measure_build(open_store(place.in_place()), aligned, decoys, crew, before.previous)
+                measure_build(place.in_place(), aligned, decoys, crew, before.previous)
             except (SlatprepError, OSError, ArithmeticError, ValueError, MemoryError) as error:
                 # What data and machines bring about; the store is published, and stays so.
                 told = f"errors were not measured ({error}); run `slatprep measure-errors`"
@@ -308,8 +307,8 @@ def _publish(
     `records` are the shards of records that were taken over; None where nothing was written.
     """
     place, previous = before.place, before.previous
-    there = None if previous is None or records is not None else previous.path
-    store, parameters = open_store(place.in_place(there)), before.wanted.parameters
+    store = place.in_place() if previous is None or records is not None else previous
+    parameters = before.wanted.parameters
     rows, warnings = new.rows if new else (), list[str]()
     if before.unnoticed:
         warnings.append(

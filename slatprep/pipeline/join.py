@@ -174,7 +174,7 @@ def _write(
     _require_unclipped(new)
     with work_beside(place.store, look=place.look) as work:
         pack_store(work, place, new, at_most(len(new.rows) // _ROWS_A_JOB, jobs), progress)
-        return publish_build(place, open_store(place.in_place()), parameters, begin)
+        return publish_build(place, place.in_place(), parameters, begin)
 
 
 def _require_unclipped(new: NextStore) -> None:

@@ -29,6 +29,7 @@ from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import put_objects
 from slatprep.storage.upload import Staged
+from slatprep.store.integrity import open_for_writing
 from slatprep.store.layout import ARRAYS, RECORD_ARRAY, arrays_with, edges_of, overlaps
 from slatprep.store.runs import Run, Runs, runs_of
 from slatprep.store.shard_writer import ShardWriter, Written
@@ -38,7 +39,6 @@ from slatprep.store.writer import (
     create_store,
     cuts_of,
     finish_store,
-    open_for_writing,
     packing_of,
     shards,
 )

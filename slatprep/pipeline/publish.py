@@ -121,11 +121,9 @@ class Destination:
         if self._upload is not None:
             self._upload.publish()
 
-    def in_place(self, there: Place | None = None) -> Place:
-        """Return where the new store lies, once it is in place; else `there`, the existing one."""
-        if self._upload is not None:
-            return self._upload.version
-        return self.store if there is None else there
+    def in_place(self) -> Store:
+        """Open the new store, once it is in place."""
+        return open_store(self.store if self._upload is None else self._upload.version)
 
     def manifests(self, store: Place | None = None) -> Place:
         """Return the folder of the records of a store that lies here; by default of a new one."""

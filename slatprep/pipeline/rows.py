@@ -46,9 +46,7 @@ class SourceStore(Store):
     """
 
     def __init__(self, store: Store, damaged: frozenset[str] = frozenset()) -> None:
-        gathered = {"metadata": store.metadata}
-        document = {"attributes": store.attributes, "consolidated_metadata": gathered}
-        super().__init__(store.path, document)
+        vars(self).update(vars(store))  # What was read of it is not read again.
         self.damaged = damaged
         # Not of itself: files of what holds itself stay open until garbage is collected.
         self.records = StoredRecords(store)
@@ -127,7 +125,7 @@ def checked_store(
     if any(file.startswith(_NEEDED) for file in files):
         return None, damaged
     records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
-    return SourceStore(open_store(source.path), records), damaged
+    return SourceStore(source, records), damaged
 
 
 IN_SPOOL = -1

@@ -54,9 +54,7 @@ def write_digests(
     files that are not here, but where the store will lie. StoreError if a file of an array is
     missing.
     """
-    import zarr
-
-    root = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+    root = open_for_writing(path)
     meant = dict(_files_of(root))
     for name in local_files(path).keys() - meant.keys() - {"zarr.json"}:
         (path / name).unlink()
@@ -76,6 +74,13 @@ def write_digests(
     columns = (np.array(names, object), np.array(sizes, np.int64), np.array(digests, object))
     for layout, values in zip(FILES, columns, strict=True):
         add_array(root, layout.name, values, "file", layout.description, level=1)
+
+
+def open_for_writing(path: Path) -> Any:
+    """Open a new store's root, without its consolidated metadata."""
+    import zarr
+
+    return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
 
 
 def attributes_digest(attributes: Mapping[str, Any]) -> str:

@@ -22,7 +22,7 @@ from slatprep.records import PIXIEVERSE, RESOLUTION, Contents, Normalization, Pl
 from slatprep.store import layout
 from slatprep.store.attributes import segments_of, store_attributes
 from slatprep.store.contract import read_metadata
-from slatprep.store.integrity import add_array, write_digests
+from slatprep.store.integrity import add_array, open_for_writing, write_digests
 from slatprep.store.runs import Piece, Runs
 
 GROUPS = ("voxel", "grid", "record")
@@ -194,10 +194,3 @@ def _write_coordinates(root: Any, properties: Sequence[str]) -> None:
             add_array(root[group], dimension, values, dimension, description)
     # The arrays that name the rows of ``asset``; the attribute is CF's.
     root["asset"].attrs["coordinates"] = "id object_id view category"
-
-
-def open_for_writing(path: Path) -> Any:
-    """Open a new store's root, without its consolidated metadata."""
-    import zarr
-
-    return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
