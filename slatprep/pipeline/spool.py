@@ -37,7 +37,7 @@ from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, is_spooled
 from slatprep.store.record import AssetRecord
-from slatprep.store.record_json import columns_of, digest_of, read_asset_record, to_json
+from slatprep.store.record_json import columns_of, digest_of, read_record, to_json
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -92,7 +92,7 @@ class Spool:
             with self._open(key) as file:
                 arrays = dict(file)  # Reads, so checks, them all.
             text = arrays["record"].tobytes()
-            record = read_asset_record(text, str(self._path(key)))
+            record = read_record(AssetRecord, text, str(self._path(key)))
             extent = arrays["extent"]
         except _TORN:
             return None
@@ -136,7 +136,7 @@ class Spool:
         latents = StructuredLatents(
             voxels.pop("coords"), voxels.pop("feats"), resolution=resolution
         )
-        record = read_asset_record(text, str(self._path(key)))
+        record = read_record(AssetRecord, text, str(self._path(key)))
         return record, field, latents, Annotation(**voxels)
 
     def record_text(self, key: str) -> bytes:

@@ -56,12 +56,21 @@ def _without(entry: AssetRecord | SourceFile, name: str) -> dict[str, object]:
     return {one.name: getattr(entry, one.name) for one in fields(entry) if one.name != name}
 
 
-def read_asset_record(text: bytes | str, where: str) -> AssetRecord:
-    """Read the record of a row, which errors call `where`.
+def read_record(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
+    """Read the record of a row or of a build, which errors call `where`.
 
-    RecordError if it is no record of this version, or breaks its schema.
+    RecordError if it is none of this version, or breaks its schema.
     """
-    return _read(AssetRecord, text, where)
+    from pydantic import ValidationError
+
+    try:
+        return read_as(kind, text)
+    except ValidationError as error:
+        found = [
+            f"{place or 'it'}: {message}{value and f', found {value}'}"
+            for place, message, value in faults_in(error)
+        ]
+        raise RecordError(where, tuple(found)) from None
 
 
 def faults_of(record: AssetRecord) -> tuple[str, ...]:
@@ -73,15 +82,10 @@ def faults_of(record: AssetRecord) -> tuple[str, ...]:
     if len(text) > MAX_RECORD_BYTES // 2:
         return (f"{len(text):,} bytes",)
     try:
-        read_asset_record(text, record.asset_id)
+        read_record(AssetRecord, text, record.asset_id)
     except RecordError as error:
         return error.faults
     return ()
-
-
-def read_build_record(text: bytes | str, where: str) -> BuildRecord:
-    """Read ``build.json``; see `read_asset_record`."""
-    return _read(BuildRecord, text, where)
 
 
 def build_id_of(head: object, digests: Iterable[tuple[str, bytes]]) -> str:
@@ -96,19 +100,6 @@ def build_id_of(head: object, digests: Iterable[tuple[str, bytes]]) -> str:
 def digest_of(text: bytes) -> bytes:
     """Return the SHA-256 of a record's text, by which builds and stores tell it from others."""
     return hashlib.sha256(text).digest()
-
-
-def _read(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
-    from pydantic import ValidationError
-
-    try:
-        return read_as(kind, text)
-    except ValidationError as error:
-        found = [
-            f"{place or 'it'}: {message}{value and f', found {value}'}"
-            for place, message, value in faults_in(error)
-        ]
-        raise RecordError(where, tuple(found)) from None
 
 
 def faults_in(error: ValidationError) -> Iterator[tuple[str, str, str]]:

@@ -17,7 +17,7 @@ from slatprep.storage.versions import MANIFESTS, is_version
 from slatprep.store.layout import RECORD_ARRAY, RECORDS_IN_CHUNK, RECORDS_IN_SHARD
 from slatprep.store.reader import Store, StoredAsset
 from slatprep.store.record import AssetRecord, BuildRecord
-from slatprep.store.record_json import read_asset_record, read_build_record
+from slatprep.store.record_json import read_record
 
 _CHUNKS_KEPT = 8
 """Chunks of texts in memory, 0.6 MB each."""
@@ -49,7 +49,7 @@ class StoredRecords:
     def read(self, row: int) -> AssetRecord:
         """Return the record of a row; StoreError if it cannot be read."""
         where = f"{self.store.path}: {RECORD_ARRAY}, row {row}"
-        return read_asset_record(self.text(row), where)
+        return read_record(AssetRecord, self.text(row), where)
 
     def text(self, row: int) -> str:
         """Return the record of a row as its JSON, unchecked; StoreError where it cannot be read."""
@@ -106,7 +106,7 @@ def build_text(folder: Place) -> bytes:
 
 def build_in(folder: Place) -> BuildRecord:
     """Read the record of a build; StoreError where it cannot be."""
-    return read_build_record(build_text(folder), str(folder / BUILD))
+    return read_record(BuildRecord, build_text(folder), str(folder / BUILD))
 
 
 def manifests_of(store: Place) -> Place:

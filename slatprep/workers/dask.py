@@ -172,10 +172,7 @@ class _Common:
 async def _reach(scheduler: str) -> None:
     """Connect once and leave; a Dask client waits for ever where something else answers.
 
-    Raises
-    ------
-    OSError, ValueError
-        If nothing answers in time, or the address is none.
+    OSError or ValueError if nothing answers in time, or the address is none.
     """
     arguments = distributed.Security().get_connection_args("client")
     try:

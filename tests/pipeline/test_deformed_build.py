@@ -21,7 +21,8 @@ from slatprep.inspect.verify import verify_store
 from slatprep.particles.fields import stored_field
 from slatprep.particles.transfer import transfer
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.store.record_json import FOLDER, read_asset_record, to_json
+from slatprep.store.record import AssetRecord
+from slatprep.store.record_json import FOLDER, read_record, to_json
 from slatprep.store.records import StoredRecords
 
 
@@ -55,7 +56,7 @@ def test_the_record_holds_the_map_to_the_last_bit(store):
     schema = json.loads((FOLDER / "asset_record.schema.json").read_text())
     for asset in store:
         text = str(store.read_rows("asset/record", asset.index, asset.index + 1)[0])
-        assert to_json(read_asset_record(text, "here")) == text.encode()
+        assert to_json(read_record(AssetRecord, text, "here")) == text.encode()
         jsonschema.Draft202012Validator(schema).validate(json.loads(text))
         way = StoredRecords(store).place_map(asset)
         assert way.deformation is not None

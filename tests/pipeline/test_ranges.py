@@ -11,7 +11,8 @@ from support.trees import tree
 
 from slatprep import ConfigError, InputError, build_store, open_store
 from slatprep.parameters import BuildParameters, NormalizeParameters
-from slatprep.store.record_json import read_build_record
+from slatprep.store.record import BuildRecord
+from slatprep.store.record_json import read_record
 
 
 def noisy(dataset: Dataset) -> Dataset:
@@ -77,7 +78,7 @@ def test_ranges_of_the_objects_to_train_on(make_dataset, tmp_path, ranges, bound
     source = open_store(out).normalization.source
     assert source.startswith(f"{ranges} of train by lists.json, sha256 ")
     record = summary.records.parent / "build.json"
-    told = read_build_record(record.read_bytes(), str(record))
+    told = read_record(BuildRecord, record.read_bytes(), str(record))
     assert told.parameters.normalize == chosen.normalize and told.normalization.source == source
 
     # Nothing changed: nothing is written; another list in the file: other ranges.

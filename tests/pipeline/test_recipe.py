@@ -16,7 +16,7 @@ from slatprep.pipeline.fingerprint import code_fingerprint, numeric_modules
 from slatprep.pipeline.recipe import Recipe
 from slatprep.readers.adapters import SOURCES
 from slatprep.store.record import AssetRecord, StageParameters
-from slatprep.store.record_json import read_asset_record
+from slatprep.store.record_json import read_record
 
 STAGES = StageParameters(AlignParameters(), SampleParameters())
 RECIPE = Recipe(STAGES, {"numpy": "2.0", "scipy": "1.11"}, "c0de")
@@ -26,7 +26,7 @@ DIGESTS = {"grid": "0" * 64, "slat": "1" * 64}
 @pytest.fixture(scope="module")
 def record(mixed_build: BuildSummary) -> AssetRecord:
     first, *_ = Path(str(mixed_build.records)).read_text("utf-8").splitlines()
-    return read_asset_record(first, "its first line")
+    return read_record(AssetRecord, first, "its first line")
 
 
 def test_all_that_touches_the_numbers_is_in_the_key_and_no_order():

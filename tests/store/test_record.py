@@ -18,12 +18,11 @@ from slatprep.records import PIXIEVERSE, LatentSpace, Property
 from slatprep.storage.documents import adapter_of
 from slatprep.store import open_store
 from slatprep.store.attributes import RootAttributes, read_attributes, segments_of, width_findings
-from slatprep.store.record import AssetRecord, FailedRecord
+from slatprep.store.record import AssetRecord, BuildRecord, FailedRecord
 from slatprep.store.record_json import (
     FOLDER,
     RecordError,
-    read_asset_record,
-    read_build_record,
+    read_record,
     to_json,
 )
 
@@ -34,7 +33,7 @@ def lines_of(build: BuildSummary) -> list[bytes]:
 
 @pytest.fixture
 def record(mixed_build: BuildSummary) -> AssetRecord:
-    return read_asset_record(lines_of(mixed_build)[0], "here")
+    return read_record(AssetRecord, lines_of(mixed_build)[0], "here")
 
 
 def test_every_record_follows_the_published_schema(mixed_build):
@@ -62,11 +61,11 @@ def test_the_published_schemas_are_those_of_the_classes():
 
 def test_what_is_written_is_read_again_bit_for_bit(mixed_build):
     for line in lines_of(mixed_build):
-        again = read_asset_record(line, "here")
+        again = read_record(AssetRecord, line, "here")
         assert to_json(again) == line
         assert again.alignment.transform.tolist() == json.loads(line)["alignment"]["transform"]
     file = mixed_build.records.parent / "build.json"
-    build = read_build_record(file.read_bytes(), "here")
+    build = read_record(BuildRecord, file.read_bytes(), "here")
     assert to_json(build, indent=True) + b"\n" == file.read_bytes()
 
 
@@ -84,7 +83,7 @@ def test_what_is_written_is_read_again_bit_for_bit(mixed_build):
 def test_what_is_no_record_is_refused_and_named(record, path, value):
     changed = placed(json.loads(to_json(record)), path, value)
     with pytest.raises(RecordError, match=r"^a\.jsonl, line 3: not a record") as refused:
-        read_asset_record(json.dumps(changed), "a.jsonl, line 3")
+        read_record(AssetRecord, json.dumps(changed), "a.jsonl, line 3")
     assert refused.value.faults[0].startswith(path.rpartition("/")[0])
     if path != "versions/numpy":  # That certain keys must be there, JSON Schema cannot say.
         schema = json.loads((FOLDER / "asset_record.schema.json").read_text())
@@ -98,19 +97,19 @@ def test_a_failed_asset_has_a_reason(mixed_build):
     with pytest.raises(ValueError, match="reason"):
         adapter_of(FailedRecord).validate_json(json.dumps(json.loads(skipped) | {"reason": ""}))
     with pytest.raises(RecordError):
-        read_asset_record(skipped, "here")
+        read_record(AssetRecord, skipped, "here")
 
 
 def test_text_that_is_no_json_is_refused():
     for text in ("", "{", "[]", "null", '{"status": NaN}', b"\xff"):
         with pytest.raises(RecordError):
-            read_asset_record(text, "here")
+            read_record(AssetRecord, text, "here")
 
 
 def test_nan_is_null(record):
     unknown = replace(record, alignment=replace(record.alignment, score=nan))
     assert json.loads(to_json(unknown))["alignment"]["score"] is None
-    again = read_asset_record(to_json(unknown), "here")
+    again = read_record(AssetRecord, to_json(unknown), "here")
     assert np.isnan(again.alignment.score)
     assert to_json(again) == to_json(unknown)
 

@@ -20,7 +20,7 @@ from slatprep.store.contract import Finding
 from slatprep.store.layout import RECORDS_IN_SHARD
 from slatprep.store.reader import Store
 from slatprep.store.record import BuildRecord
-from slatprep.store.record_json import RecordError, read_build_record
+from slatprep.store.record_json import RecordError, read_record
 from slatprep.store.records import BUILD, build_in, build_text, file_names, lines_of
 
 _MOST_LINES = 8
@@ -92,7 +92,7 @@ def manifest_findings(
     file, manifest = str(folder / BUILD), store.attributes.get("manifest")
     try:
         text = build_text(folder)
-        build = read_build_record(text, file)
+        build = read_record(BuildRecord, text, file)
     except RecordError as error:
         yield from fault_findings(file, "", error)
         build_id = _stated_id(text)
