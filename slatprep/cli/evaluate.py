@@ -33,7 +33,7 @@ def evaluate(
     splits: options.SplitOptions,
     spread: Annotated[Any, options.ChoiceOf("slatprep.learn.metrics:SPREADS")] = "se",
     csv_file: Annotated[options.NewFile | None, Click("--csv")] = None,
-    picture: options.NewFile | None = None,
+    picture: options.DrawnFile | None = None,
     beside: tuple[str, ...] = (),
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
@@ -61,7 +61,7 @@ def evaluate(
     csv_file
         Also write the table to this file.
     picture
-        With --grids, also draw the table as a PNG.
+        With --grids, also draw the table.
     beside : pixie|slat-phys|FILE.csv
         Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a CSV with
         names in the first column and columns named as here; may be repeated.
@@ -82,8 +82,6 @@ def evaluate(
         raise click.UsageError("nothing to measure; give PREDICTIONS, --grids, or both")
     if picture is not None and not grids:
         raise click.UsageError("--picture draws methods side by side; give --grids as well")
-    if picture is not None and picture.suffix.lower() != ".png":
-        raise click.BadParameter(f"{picture} does not end in .png", param_hint="--picture")
     folders = _folders_of_grids(grids)
     published = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside

@@ -6,7 +6,6 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -298,14 +297,14 @@ def predict(
             "and `slatprep transfer` gives them materials"
         )
     decoder = work.load_checkpoint(checkpoint, device)
-    image = _sample_latents(output, source, out, seed, device) if is_image else None
     space = decoder.contents.latents
-    if image is not None:
+    session, sampling = None, dict[str, float]()
+    if is_image:
+        source, session, sampling = _sample_latents(output, source, out, seed, device)
         standardised = "no"  # TRELLIS samples them as its decoders take them.
-    place = image.latents if image else source
-    read = LatentsReader(place, assets, space, standardised, output.note, output.problem)
+    read = LatentsReader(source, assets, space, standardised, output.note, output.problem)
     counts = {"predicted": 0, "voxels": 0}
-    seconds = {**(image.seconds if image else {}), "read": 0.0, "decode": 0.0, "write": 0.0}
+    seconds = {**sampling, "read": 0.0, "decode": 0.0, "write": 0.0}
     with output.progress("predict") as progress:
         progress(0, len(read.ids))
         for number, field in enumerate(work.predict(decoder, read, batch_voxels=batch_voxels)):
@@ -321,9 +320,9 @@ def predict(
             seconds["decode"] += field.seconds
             progress(counts["predicted"] + len(read.problems), len(read.ids))
     seconds["read"] = read.seconds
-    if image and gaussians is not None and counts["predicted"]:
+    if session and gaussians is not None and counts["predicted"]:
         begin = time.perf_counter()
-        _write_gaussians(output, image, out, gaussians, far)
+        _write_gaussians(output, session, Path(str(source)), out, gaussians, far)
         seconds["gaussians"] = time.perf_counter() - begin
     about = {"path": out, "checkpoint": decoder.sha256, "size": decoder.size}
 
@@ -331,10 +330,10 @@ def predict(
         output.record(f"Predictions in {out}", counts)
         each = 1e3 / max(counts["predicted"], 1)
         stages = {**seconds, "in all": sum(seconds.values())}
-        columns, shown = ("stage", "seconds", "ms an asset", "SLAT-Phys, s"), 4 if image else 3
+        columns, shown = ("stage", "seconds", "ms an asset", "SLAT-Phys, s"), 4 if is_image else 3
         rows = [(name, s, s * each, SECONDS.get(name, ""))[:shown] for name, s in stages.items()]
         output.table("Time", columns[:shown], rows)
-        if image:
+        if is_image:
             others = ", ".join(
                 f"{name} {spent:,.0f} s" for name, spent in SECONDS_OF_OTHERS.items()
             )
@@ -344,17 +343,10 @@ def predict(
     output.made(document, show, complete=not read.problems)
 
 
-@dataclass(frozen=True)
-class _Image:
-    """Latents of an image: their file, the pipeline that sampled them, and time by stage."""
-
-    latents: Path
-    session: Session
-    seconds: Mapping[str, float]
-
-
-def _sample_latents(output: Output, source: Place, out: Path, seed: int, device: str) -> _Image:
-    """Sample the latents of an image."""
+def _sample_latents(
+    output: Output, source: Place, out: Path, seed: int, device: str
+) -> tuple[Path, Session, dict[str, float]]:
+    """Sample the latents of an image; return their file, the pipeline, and time by stage."""
     from slatprep import extract as work
 
     session = work.load_session(device=device)
@@ -363,10 +355,12 @@ def _sample_latents(output: Output, source: Place, out: Path, seed: int, device:
     if isinstance(result, InputError):
         raise result
     output.note(f"latents: {extractions[0].slat}{', drawn before' if result.kept else ''}")
-    return _Image(extractions[0].slat, session, result.seconds)
+    return extractions[0].slat, session, dict(result.seconds)
 
 
-def _write_gaussians(output: Output, image: _Image, out: Path, path: Path, far: Any) -> None:
+def _write_gaussians(
+    output: Output, session: Session, latents: Path, out: Path, path: Path, far: Any
+) -> None:
     """Decode an image's latents to Gaussians, and give each the material of its voxel."""
     from slatprep.extract import decode_gaussians
     from slatprep.particles import transfer as work
@@ -376,8 +370,8 @@ def _write_gaussians(output: Output, image: _Image, out: Path, path: Path, far: 
     from slatprep.storage.files import file_name
 
     plain = out / "gaussians.ply"
-    decode_gaussians(image.session, read_slat(image.latents, image.latents.parent), plain)
-    field = predicted_field(out / f"{file_name(image.latents.stem)}.npz", None)
+    decode_gaussians(session, read_slat(latents, latents.parent), plain)
+    field = predicted_field(out / f"{file_name(latents.stem)}.npz", None)
     particles = read_particles(plain, "trellis")
     result = work.transfer(particles.in_slat(), field, far=far)
     if result.far:

@@ -12,26 +12,13 @@ from slatprep.export.formats import Exported, ExportOptions, Writer, describe_co
 from slatprep.export.target import FORMAT
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
-from slatprep.store.layout import MERGED_COLUMNS
+from slatprep.store.layout import LAYOUTS, MERGED_COLUMNS
 
 if TYPE_CHECKING:
     import h5py
 
-_DATASETS: dict[str, dict[str, Any]] = {
-    "coords": {"description": "SLAT coordinate, x, y, z", "units": "voxel"},
-    "feats": {"description": "SLAT latents"},
-    "properties": {"description": "normalised properties in [-1, 1], NaN where not valid"},
-    "properties_si": {"description": "properties, NaN where not valid"},
-    "material": {"description": "class, 255 where not valid"},
-    "valid": {"description": "an annotation was found near enough"},
-    "distance": {"description": "distance to the annotation used", "units": "voxel"},
-    "place": {"description": "where it was looked up, PixieVerse frame, [-0.5, 0.5]^3"},
-    "transform": {
-        "description": "PixieVerse frame to SLAT frame, both the unit cube [-0.5, 0.5]^3"
-    },
-    "spread": {"description": "standard deviation of normalised properties over the annotations"},
-    "votes": {"description": "share of the annotations that give the class"},
-}
+_DATASETS = ("coords", "feats", "properties", "properties_si", "material", "valid", "distance",
+             "place", "transform", *MERGED_COLUMNS)  # fmt: skip
 
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
@@ -60,12 +47,15 @@ def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> I
 def _write_group(file: h5py.File, asset: StoredAsset) -> None:
     group = file.create_group(file_name(asset.asset_id))
     group.attrs.update(describe_columns(asset))
-    for name, attributes in _DATASETS.items():
+    for name in _DATASETS:
         if name in MERGED_COLUMNS and not asset.store.merges:
             continue
         packing = {} if name == "transform" else {"compression": "gzip", "shuffle": True}
         dataset = group.create_dataset(name, data=getattr(asset, name), **packing)
-        dataset.attrs.update(attributes)
+        of = LAYOUTS.get(f"voxel/{name}") or LAYOUTS.get(f"asset/{name}")
+        dataset.attrs["description"] = of.description if of else "properties, NaN where not valid"
+        if of and of.unit:
+            dataset.attrs["units"] = of.unit
         if name.startswith("properties") or name == "spread":
             table = asset.store.contents.properties
             dataset.attrs["columns"] = [one.name for one in table]

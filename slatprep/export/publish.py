@@ -57,10 +57,9 @@ def publish_store(
 ) -> PublishSummary:
     """Write a store of the local disk, or WebDataset shards of it, as a dataset for a hub.
 
-    An earlier result at `out` is replaced when the new one is complete. `pictures` for the card
-    are PNG bytes by file name. For shards, `verdicts` is as in `slatprep.export.export_store`, and
-    `progress` gets the number of assets done and of all. ConfigError if the store is not local, or
-    `out` lies in one or holds other files. StoreError if a file differs from its digest.
+    `pictures` for the card are PNG bytes by file name; for shards, `verdicts` and `progress` are as
+    in `slatprep.export.export_store`. ConfigError if the store is not local, or `out` lies in one
+    or holds other files. StoreError if a file differs from its digest.
     """
     opened, stated, out = open_store(store), stated or Stated(), Path(out)
     local = storage_of(opened.path).local

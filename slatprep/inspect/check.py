@@ -199,12 +199,8 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     """Sample an asset's annotation again from the stored grid and compare it with the store.
 
     Returns the share of SLAT voxels that get an annotation now, and the difference (N,) of each
-    voxel by the arrays of `TOLERANCES`: 1 where valid or material changed, the largest difference
-    of normalised properties where both are valid (0 elsewhere), and that of the distance [voxel].
-    NaN counts as a difference.
-
-    The stored grid is a single annotation. Labels merged from several are compared only where all
-    agree, or where only the stored one has a label.
+    voxel by the arrays of `TOLERANCES`: 1 where valid or material changed, else the largest one. As
+    the stored grid is one annotation, labels merged of several are compared only where all agree.
     """
     parameters = asset.store.about.build.parameters.sample
     # What is looked up is copied, so it need not be brought to SI units and back.
@@ -231,9 +227,8 @@ def choose_assets(
 ) -> list[str]:
     """Choose assets to check, each once: those named, then the worst, then the ambiguous.
 
-    `asset_ids` may be prefixes of a single id. The `worst` assets follow by verdict, failed first,
-    then by confidence, then by the lower fitness. `ambiguous` takes all above the threshold of
-    ambiguity, the most ambiguous first. StoreError if no asset has one of the ids.
+    The `worst` follow by verdict, failed first, then by confidence, then by the lower fitness;
+    `ambiguous` takes all above the threshold of ambiguity, the most ambiguous first.
     """
     rows = [store.match(asset_id) for asset_id in asset_ids]
     if worst:

@@ -156,11 +156,6 @@ class StoreStatistics:
     histograms: tuple[Histogram, ...]
     joint: JointHistogram | None
 
-    @property
-    def groups(self) -> tuple[GroupStatistics, ...]:
-        """All groups: the total, the classes, the categories."""
-        return (self.total, *self.classes, *self.categories)
-
 
 def store_statistics(
     store: Store | str | Place,
@@ -371,7 +366,8 @@ COLUMNS = ("by", "name", "side", "assets", "voxels", "share", "unannotated", "pr
 
 def table_of(statistics: StoreStatistics) -> Iterator[tuple[str | int | float, ...]]:
     """Yield a row of `COLUMNS` for each group, side, property and scale."""
-    for group, side in product(statistics.groups, SIDES):
+    groups = statistics.total, *statistics.classes, *statistics.categories
+    for group, side in product(groups, SIDES):
         own: SideStatistics = getattr(group, side)
         which = (group.by, group.name, side, own.assets, own.voxels, own.share, own.unannotated)
         for name, found in own.properties.items():

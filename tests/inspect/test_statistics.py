@@ -92,7 +92,7 @@ def hold(path: Path, found: StoreStatistics, weight: str) -> None:
         weights = np.ones(len(owner))
         if weight == "asset":
             weights = 1.0 / np.bincount(owner)[owner]
-        for group in found.groups:
+        for group in (found.total, *found.classes, *found.categories):
             chosen = np.ones(len(owner), bool)
             if group.by == "class":
                 chosen = material == MATERIAL_CLASSES.index(group.name)

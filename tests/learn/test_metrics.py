@@ -330,7 +330,7 @@ def test_side_by_side_on_the_same_objects(case, tmp_path):
         (("--grids", "{results}", "--grids", "{results}"), "two folders are called 'eleven'"),
         (("{results}", "--picture", "x.png"), "--picture draws methods"),
         (("--grids", "={results}"), "has no name before ="),
-        (("--grids", "{results}", "--picture", "x.gif"), "x.gif does not end in .png"),
+        (("--grids", "{results}", "--picture", "x.gif"), "x.gif ends in none of .png, .svg, .pdf"),
     ],
 )
 def test_what_cannot_be_compared_is_said(case, arguments, message):

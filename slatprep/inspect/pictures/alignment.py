@@ -73,9 +73,8 @@ def draw_alignment(
 ) -> Figure:
     """Draw an alignment as a figure of `WIDTH` x `HEIGHT` pixels, wider by its further columns.
 
-    If other placements are tied, the best of them is shown as well. A pixel of the figure has
-    `finer` pixels of a panel along each edge. The figure must be drawn and saved within
-    `slatprep.inspect.pictures.canvas.STYLE`.
+    A pixel of the figure has `finer` pixels of a panel along each edge. The figure must be drawn
+    and saved within `slatprep.inspect.pictures.canvas.STYLE`.
     """
     if alignment.open_placements:
         best = max(alignment.open_placements, key=lambda placement: placement.score)

@@ -126,7 +126,8 @@ def draw_voxels(
         np.maximum.at(buffer, (y * side + x)[inside], key[inside])
         normal = sign * linear[:, axis] / np.linalg.norm(linear[:, axis])
         owners.append(exposed)
-        shades.append(np.full(len(exposed), _shade(normal, contrast)))
+        lambert = max(float(normal @ LIGHT / np.linalg.norm(LIGHT)), 0.0)
+        shades.append(np.full(len(exposed), 1.0 - contrast * 0.34 * (1.0 - lambert)))
         drawn += len(exposed)
     if not drawn:
         return Drawing(np.ones((view.size, view.size, 3)), np.zeros((view.size, view.size)))
@@ -153,11 +154,6 @@ def _side_pixels(
     inside = (np.abs(along) <= 0.5 + slack).all(axis=1)
     seam = (np.abs(along) > 0.5 - slack).any(axis=1)
     return offsets[inside], (along @ spanned[2])[inside], (~seam[inside]).astype(np.int64)
-
-
-def _shade(normal: NDArray[np.float64], contrast: float) -> float:
-    lambert = max(float(normal @ LIGHT / np.linalg.norm(LIGHT)), 0.0)
-    return 1.0 - contrast * 0.34 * (1.0 - lambert)
 
 
 def _resolve(buffer: NDArray[np.int64], lit: NDArray[np.float64], view: View) -> Drawing:

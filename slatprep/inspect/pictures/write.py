@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError, amount
+from slatprep.errors import amount
 from slatprep.inspect.check import FITNESS, AlignmentCheck, check_alignment
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import draw_alignment, error_picture, outlined
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, scene_of, views
 from slatprep.records import Place
-from slatprep.storage.atomic import staged
+from slatprep.storage.atomic import staged, writing
 from slatprep.storage.files import file_name
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import StoredRecords
@@ -50,9 +50,8 @@ def write_pictures(
 ) -> tuple[list[Path], Path | None]:
     """Draw alignments as files; return the file of each asset, and the contact sheet if several.
 
-    For a single asset `target` is a file with a suffix of `FORMATS`. Otherwise it is a folder for a
-    PNG per asset, named by its id, and a contact sheet of the first `MOST`. StoreError if a file
-    cannot be written, or a record cannot be read.
+    For a single asset `target` is a file with a suffix of `FORMATS`, otherwise a folder for a PNG
+    per asset, named by its id, and a contact sheet of the first `MOST`.
     """
     kind = target.suffix.lower()[1:]
     if len(checks) == 1 and kind in canvas.FORMATS:
@@ -155,11 +154,5 @@ def title_of(asset: StoredAsset) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    try:
-        with staged(path) as file:
-            file.write_bytes(content)
-    except OSError as error:
-        raise StoreError(
-            f"the picture: cannot be written to {path} ({error.strerror or error}); make room "
-            "there, or name another place with --picture, or --picture none"
-        ) from error
+    with writing("the picture (--picture says where, or none)", path), staged(path) as file:
+        file.write_bytes(content)

@@ -164,11 +164,7 @@ def _chosen(store: Store) -> list[int]:
 def _write_page(
     file: TextIO, content: Mapping[str, Any], drawn: Sequence[Drawn], side: int
 ) -> None:
-    """Write a page to a UTF-8 file with plain line feeds.
-
-    `content` is from `slatprep.inspect.report.content.page_content`. Assets `drawn` are shown by
-    `side` voxels per edge.
-    """
+    """Write a page of `page_content`, with assets `drawn` by `side` voxels per edge."""
     sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     style = _asset("style.css")
     script = "\n".join(_asset("js", f"{name}.js") for name in SCRIPTS)

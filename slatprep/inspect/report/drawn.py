@@ -110,11 +110,7 @@ def _agreement(asset: StoredAsset) -> tuple[float, tuple[float, ...]]:
 
 
 def thumbnail(asset: StoredAsset) -> NDArray[np.uint8]:
-    """Draw the SLAT voxels of an asset from three directions, (SIDE, 3 * SIDE).
-
-    Pixels are indices into `palette`: 0 for the background, elsewhere the nearest voxel's class and
-    brightness.
-    """
+    """Draw the SLAT voxels of an asset from three directions, (SIDE, 3 * SIDE), in `palette`."""
     grid = np.zeros((RESOLUTION,) * 3, dtype=np.uint8)
     # Of more classes some share a colour: a PNG's palette has 256.
     colour = np.where(asset.material == UNANNOTATED, CLASSES, asset.material % CLASSES)
@@ -162,13 +158,10 @@ def _project(view: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _brightness(depth: NDArray[np.intp], hit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the brightness of each pixel by Lambert's law, 0..1.
-
-    The slope is that of the depth averaged over a small window, because steps of whole voxels would
-    show as stripes.
-    """
+    """Return the brightness of each pixel by Lambert's law, 0..1."""
     from scipy.ndimage import uniform_filter
 
+    # Slopes are of an averaged depth: steps of whole voxels would show as stripes.
     weight = uniform_filter(hit.astype(np.float64), _SMOOTHING)
     smooth = uniform_filter(np.where(hit, depth, 0).astype(np.float64), _SMOOTHING)
     smooth /= np.maximum(weight, 1e-9)
