@@ -42,8 +42,8 @@ MASK = files.ArraySpec(shapes=(_CUBE,), kinds="bfiu")
 BOUND = files.ArraySpec(shapes=(), kinds="biufU")
 
 _DIFFERS, _CONTRADICTS = 0.05, 0.5
-"""Shares of a grid that a mask leaves out, or of a mask that is background, above which it is told,
-and a grid's above which mask and grid cannot be of one object."""
+"""Share of a grid that its mask leaves out, or of the mask that is background, above which that is
+told; and above which, of both, the two cannot be of one object."""
 
 UNLABELLED = -1
 """Class id of an occupied voxel that Pixie's labelling set aside."""
@@ -100,7 +100,7 @@ def read_grid(
     if not occupancy.any():
         raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
     annotated = _annotated(occupancy, material, path, warnings)
-    if pair.mask is not None:
+    if pair.mask is not None and raw:
         warnings += _contradictions(pair.mask, occupancy, material, pair.roots.plausibility)
 
     cells = np.flatnonzero(annotated)
@@ -199,9 +199,10 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
 def _contradictions(
     path: Place, mask: NDArray[np.bool_], material: NDArray[np.int8], plausibility: str
 ) -> list[str]:
-    """Hold a mask against the classes of its grid, and return what a person should know.
+    """Hold a mask against the classes of its raw grid, and return what a person should know.
 
-    InputError where it leaves out most voxels with a class, unless `plausibility` lets them pass.
+    A prediction may have any class outside its mask. InputError where most of either is not in the
+    other, unless `plausibility` lets that pass.
     """
     classified = material != BACKGROUND
     left_out = 1 - float(mask[classified].mean())
@@ -211,7 +212,7 @@ def _contradictions(
     fault = (
         f"leaves out {left_out:.0%} of the voxels with a class, and {empty:.0%} of it is background"
     )
-    if left_out > _CONTRADICTS and plausibility == "refuse":
+    if min(left_out, empty) > _CONTRADICTS and plausibility == "refuse":
         expected = "the mask of this grid, in the same axes, or none: mask = [] in [pixieverse]"
         raise InputError(path, fault, f'{expected}; or set plausibility = "warn" there')
     way = "is it of this grid, and in the same axes? mask = [] in [pixieverse] reads none"

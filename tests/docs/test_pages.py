@@ -262,7 +262,7 @@ def test_formats_describes_every_array():
 
 @pytest.mark.parametrize("name", ["demo.toml", "mine.example.toml"])
 def test_example_definitions_are_valid(name, tmp_path):
-    text = (ROOT / "definitions" / name).read_text("utf-8")
+    text = (ROOT / "manifests" / name).read_text("utf-8")
     # Every example key that is commented out counts as well.
     full = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.M)
     for variant in (text, full):

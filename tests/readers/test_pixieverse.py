@@ -140,6 +140,9 @@ def test_a_mask_that_contradicts_its_grid_is_told_or_refused(make_pair):
     with pytest.raises(InputError, match=r"mask\.npy: leaves out 70% of .*mask = \[\]") as caught:
         read_field(other)
     assert 'plausibility = "warn"' in str(caught.value)
+    part = same & np.roll(same, 7, axis=0)
+    *_, told = read_field(make_pair(grid=grid, mask=part)).warnings
+    assert "leaves out 70% of the voxels with a class, and 0% of it is" in told
     for plausibility, tells in (("warn", True), ("off", False)):
         roots = replace(other.roots, plausibility=plausibility)
         field = read_field(replace(other, roots=roots))

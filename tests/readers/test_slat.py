@@ -148,21 +148,13 @@ def test_coordinates_of_a_grid_of_half_the_side_are_told(make_pair):
     assert read_latents(make_pair(**cloud(32, count=20))).warnings == ()
 
 
-def test_latents_that_no_encoder_gives_are_refused_or_told(make_pair):
+def test_latents_that_no_encoder_gives_are_told(make_pair):
     whole = cloud()
     feats = whole["feats"]
-    for wrong, said in (
-        (0 * feats, "feats are the same in all 200 rows; expected latents that differ"),
-        (0 * feats + feats[0], "feats are the same in all 200 rows"),
-        (
-            changed(feats, ((5, 2), 2.0**100)),
-            r"feats is 1\.26\S*e\+30 in row 5, channel 2; .*within 10,000 of 0",
-        ),
-        (changed(feats, ((5, 2), -65504)), r"feats is -65504\.0 in row 5, channel 2"),
-    ):
-        with pytest.raises(InputError, match=said):
-            read_latents(make_pair(**whole | {"feats": wrong}))
     for odd, said in (
+        (0 * feats, "feats are the same in all 200 rows"),
+        (0 * feats + feats[0], "feats are the same in all 200 rows"),
+        (changed(feats, ((5, 2), -65504)), "feats reach 6.55e+04"),
         (changed(feats, (np.s_[:, [2, 7]], 1.5)), "channel 2, 7 of feats is the same in all rows"),
         (changed(feats, (np.s_[:30], 0)), "feats are 0 in 15% of the rows"),
     ):
