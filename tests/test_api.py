@@ -121,21 +121,18 @@ def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_f
         slatprep.align_voxels(field.occupancy, fine, resolution=512)
 
 
-@pytest.mark.parametrize(
-    ("voxels", "said"),
-    [
-        (np.zeros((64, 64, 64), bool), "with a voxel in it"),
-        (np.empty((0, 3)), "with a voxel in it"),
-        (np.full((64, 64, 64), 0.1), "values other than 0 and 1"),
-        (np.full((64, 64, 64), np.nan), "values other than 0 and 1"),
-        (np.full((64, 64, 64), -1), "values other than 0 and 1"),
-        (np.ones((5, 4)), r"shape \(5, 4\)"),
-        ([[0, 0, 64]], "from 0 to 64; expected whole numbers in 0..63"),
-        ([[0, 0, -1]], "from -1 to 0"),
-        ([[0.5, 0, 0]], "whole numbers"),
-        ([[np.nan, 0, 0]], "whole numbers"),
-    ],
-)
+@pytest.mark.parametrize(("voxels", "said"), [
+    (np.zeros((64, 64, 64), bool), "with a voxel in it"),
+    (np.empty((0, 3)), "with a voxel in it"),
+    (np.full((64, 64, 64), 0.1), "values other than 0 and 1"),
+    (np.full((64, 64, 64), np.nan), "values other than 0 and 1"),
+    (np.full((64, 64, 64), -1), "values other than 0 and 1"),
+    (np.ones((5, 4)), r"shape \(5, 4\)"),
+    ([[0, 0, 64]], "from 0 to 64; expected whole numbers in 0..63"),
+    ([[0, 0, -1]], "from -1 to 0"),
+    ([[0.5, 0, 0]], "whole numbers"),
+    ([[np.nan, 0, 0]], "whole numbers"),
+])  # fmt: skip
 def test_what_is_no_voxel_set_is_refused_in_words(voxels, said):
     with pytest.raises(ValueError, match=said):
         slatprep.align_voxels(voxels, [[1, 2, 3]])
@@ -143,17 +140,14 @@ def test_what_is_no_voxel_set_is_refused_in_words(voxels, said):
         slatprep.align_voxels([[1, 2, 3]], voxels)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"engine": "opend3d"}, "AlignParameters: engine: got 'opend3d'; expected 'field'"),
-        ({"scale_bounds": (2, 1)}, r"scale_bounds.0: got 2"),
-        ({"radius": -1}, "radius: got -1"),
-        ({"method": "zz"}, "SampleParameters: method: got 'zz'; expected 'vote' or 'nearest'"),
-        ({"max_distance": np.nan}, "max_distance: got nan"),
-        ({"vote_width": 0}, "vote_width: got 0"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "said"), [
+    ({"engine": "opend3d"}, "AlignParameters: engine: got 'opend3d'; expected 'field'"),
+    ({"scale_bounds": (2, 1)}, r"scale_bounds.0: got 2"),
+    ({"radius": -1}, "radius: got -1"),
+    ({"method": "zz"}, "SampleParameters: method: got 'zz'; expected 'vote' or 'nearest'"),
+    ({"max_distance": np.nan}, "max_distance: got nan"),
+    ({"vote_width": 0}, "vote_width: got 0"),
+])  # fmt: skip
 def test_parameters_that_make_no_sense_are_refused_in_words(wrong, said):
     asset = make_asset(3)
     with pytest.raises(ConfigError, match=said):
@@ -166,13 +160,8 @@ def test_parameters_that_make_no_sense_are_refused_in_words(wrong, said):
 
 def test_type_checkers_see_the_package_from_outside_the_checkout(tmp_path):
     script = tmp_path / "script.py"
-    script.write_text(
-        "import slatprep\n"
-        "store = slatprep.open_store('x')\n"
-        "reveal_type(store)\n"
-        "reveal_type(store[0])\n"
-        "reveal_type(store[1:])\n"
-    )
+    asked = "".join(f"reveal_type({one})\n" for one in ("store", "store[0]", "store[1:]"))
+    script.write_text(f"import slatprep\nstore = slatprep.open_store('x')\n{asked}")
     # What the package stands on is large, and no part of what is asked.
     (tmp_path / "mypy.ini").write_text(
         "[mypy]\nfollow_imports = skip\nincremental = False\n"

@@ -110,9 +110,7 @@ def test_latents_and_their_record_are_what_the_pipeline_returns(session, images,
         assert record[key]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def test_same_seed_gives_the_same_bytes_and_is_not_drawn_twice(
-    session, images, tmp_path, monkeypatch
-):
+def test_a_seed_gives_its_bytes_and_is_drawn_once(session, images, tmp_path, monkeypatch):
     for folder in ("a", "b"):
         run(session, images, tmp_path / folder, 3)
     for path in (tmp_path / "a").iterdir():
@@ -265,9 +263,8 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(images, tmp_pa
             return super().preprocess_image(input)
 
     pipeline = Printing()
-    module = SimpleNamespace(
-        TrellisImageTo3DPipeline=SimpleNamespace(from_pretrained=lambda name: pipeline)
-    )
+    loader = SimpleNamespace(from_pretrained=lambda name: pipeline)
+    module = SimpleNamespace(TrellisImageTo3DPipeline=loader)
     monkeypatch.setitem(sys.modules, "trellis", ModuleType("trellis"))
     monkeypatch.setitem(sys.modules, "trellis.pipelines", module)
     words = [*map(str, images), "--out", str(tmp_path / "slat"), "--seed", "7"]

@@ -8,26 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slatprep import normalize
 from slatprep.errors import ConfigError
-from slatprep.normalize import (
-    PIXIE_RANGES,
-    change_ranges,
-    denormalize_properties,
-    from_mapped,
-    normalization_of,
-    normalize_and_count,
-    normalize_change,
-    normalize_properties,
-    property_extent,
-    ranges_from_extents,
-    to_mapped,
-)
 from slatprep.readers.ranges import read_ranges
 from slatprep.records import MaterialField, Normalization
 
 
 def ranges(source: str, *spans: tuple[float, float]) -> Normalization:
-    return normalization_of(np.array(spans), source)
+    return normalize.normalization_of(np.array(spans), source)
 
 
 DECADES = ranges("by hand", (4.0, 12.0), (2.0, 4.0), (0.2, 0.4))
@@ -36,7 +24,8 @@ DECADES = ranges("by hand", (4.0, 12.0), (2.0, 4.0), (0.2, 0.4))
 def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted():
     # 10^4..10^12: 10^6 lies a quarter of the way, 2 * 0.25 - 1 = -0.5.
     properties = [[1e6, 1e3, 0.35], [1e4, 1e2, 0.2], [1e12, 1e4, 0.4], [np.nan] * 3]
-    values, clipped = normalize_and_count([*properties, [1e3, 1e5, 0.3], [1e13, 1e3, 0.5]], DECADES)
+    properties += [[1e3, 1e5, 0.3], [1e13, 1e3, 0.5]]
+    values, clipped = normalize.normalize_and_count(properties, DECADES)
     np.testing.assert_allclose(values[0], [-0.5, 0.0, 0.5], atol=1e-6)
     np.testing.assert_array_equal(values[1:4], [[-1, -1, -1], [1, 1, 1], [np.nan] * 3])
     np.testing.assert_allclose(values[4:], [[-1, 1, 0], [1, 0, 1]], atol=1e-6)
@@ -46,10 +35,10 @@ def test_the_ends_are_not_clipped_and_what_lies_beyond_is_counted():
 
 def test_properties_are_mapped_and_brought_back_by_hand():
     properties = [[1e6, 1e3, 0.35], [2e11, 7850.0, 0.28]]
-    mapped = to_mapped(properties)
+    mapped = normalize.to_mapped(properties)
     by_hand = [[6.0, 3.0, 0.35], [11 + np.log10(2), np.log10(7850), 0.28]]
     np.testing.assert_allclose(mapped, by_hand, rtol=1e-12)
-    back = from_mapped(mapped)
+    back = normalize.from_mapped(mapped)
     np.testing.assert_allclose(back, properties, rtol=1e-6)
     assert back.dtype == np.float32
 
@@ -57,11 +46,11 @@ def test_properties_are_mapped_and_brought_back_by_hand():
 def test_values_of_other_ranges_by_hand_are_not_clipped():
     wide = ranges("by hand", (0.0, 16.0), (2.0, 6.0), (0.3, 0.4))
     # Of 4..12, 2..4 and 0.2..0.4: -0.5 is 6, 2.5 and 0.25; 1 is 12, 4 and 0.4.
-    values = change_ranges([[-0.5] * 3, [1.0] * 3], DECADES, wide)
+    values = normalize.change_ranges([[-0.5] * 3, [1.0] * 3], DECADES, wide)
     np.testing.assert_allclose(values, [[-0.25, -0.75, -2.0], [0.5, 0.0, 1.0]], atol=1e-12)
 
 
-@pytest.mark.parametrize("way", [normalize_properties, denormalize_properties])
+@pytest.mark.parametrize("way", [normalize.normalize_properties, normalize.denormalize_properties])
 @pytest.mark.parametrize("shape", [(2, 2), (2, 4), (3, 7), ()])
 def test_columns_without_a_range_are_refused(way, shape):
     with pytest.raises(ValueError, match=r"expected \(N, 3\), a column each of youngs_modulus"):
@@ -74,11 +63,12 @@ MATERIALS = st.tuples(st.floats(1.1e3, 7e10), st.floats(51, 7400), st.floats(0.2
 @given(st.lists(MATERIALS, min_size=1, max_size=20))
 def test_the_inverse_is_exact_to_float32(rows):
     properties = np.array(rows, dtype=np.float32)
-    values, clipped = normalize_and_count(properties, PIXIE_RANGES)
+    values, clipped = normalize.normalize_and_count(properties, normalize.PIXIE_RANGES)
     assert clipped.sum() == 0
-    # Half a step of float32 near 1 is 3e-8; eight decades of E stretch it to
-    # 3e-8 * 4 ln 10 of the value.
-    np.testing.assert_allclose(denormalize_properties(values, PIXIE_RANGES), properties, rtol=1e-6)
+    # Half a step of float32 near 1 is 3e-8, which eight decades of E stretch by 4 ln 10.
+    np.testing.assert_allclose(
+        normalize.denormalize_properties(values, normalize.PIXIE_RANGES), properties, rtol=1e-6
+    )
 
 
 def _field(properties: list[list[float]]) -> MaterialField:
@@ -88,10 +78,10 @@ def _field(properties: list[list[float]]) -> MaterialField:
 
 
 def test_dataset_ranges_span_all_assets():
-    here = property_extent(_field([[1e5, 100, 0.2], [1e7, 1000, 0.3]]))
-    there = property_extent(_field([[1e9, 10, 0.25]]))
+    here = normalize.property_extent(_field([[1e5, 100, 0.2], [1e7, 1000, 0.3]]))
+    there = normalize.property_extent(_field([[1e9, 10, 0.25]]))
     np.testing.assert_allclose(here, [[5, 7], [2, 3], [0.2, 0.3]], atol=1e-7)
-    found = ranges_from_extents([here, there])
+    found = normalize.ranges_from_extents([here, there])
     assert found.source == "dataset"
     np.testing.assert_allclose([(r.lo, r.hi) for r in found.ranges],
                                [(5, 9), (1, 3), (0.2, 0.3)], atol=1e-7)  # fmt: skip
@@ -99,8 +89,8 @@ def test_dataset_ranges_span_all_assets():
 
 def test_one_value_in_all_the_dataset_becomes_zero():
     field = _field([[1e5, 100, 0.3]])
-    own = ranges_from_extents([property_extent(field)])
-    values, clipped = normalize_and_count(field.properties, own)
+    own = normalize.ranges_from_extents([normalize.property_extent(field)])
+    values, clipped = normalize.normalize_and_count(field.properties, own)
     np.testing.assert_allclose(values, [[0, 0, 0]], atol=1e-6)
     assert clipped.sum() == 0
 
@@ -108,11 +98,13 @@ def test_one_value_in_all_the_dataset_becomes_zero():
 @pytest.mark.parametrize("extents", [np.zeros((0, 3, 2)), np.full((1, 3, 2), np.nan)])
 def test_ranges_of_nothing_are_refused(extents):
     with pytest.raises(ValueError, match="at least one asset"):
-        ranges_from_extents(extents)
+        normalize.ranges_from_extents(extents)
 
 
 def test_a_change_is_scaled_as_the_values_are():
-    np.testing.assert_allclose(normalize_change([2.0, 1.0, 0.1], DECADES), [0.5, 1.0, 1.0])
+    np.testing.assert_allclose(
+        normalize.normalize_change([2.0, 1.0, 0.1], DECADES), [0.5, 1.0, 1.0]
+    )
 
 
 def test_ranges_are_read_from_toml_and_json(tmp_path):
@@ -145,7 +137,7 @@ def test_pixie_s_own_file_gives_pixie_s_ranges(tmp_path, form):
     lines = "".join(f"{name}: {value}  # log10\n" for name, value in numbers.items())
     path.write_text(f"---\n{lines}\n" if form == "lines" else json.dumps(numbers))
     found = read_ranges(path)
-    assert found.ranges == PIXIE_RANGES.ranges
+    assert found.ranges == normalize.PIXIE_RANGES.ranges
     assert found.source == "normalization_ranges.yaml"
 
 

@@ -47,9 +47,8 @@ def test_minimal_file_leaves_everything_else_at_its_default(folder):
     assert load_parameters(str(path)) == parameters
 
 
-def test_paths_are_relative_to_the_file_and_not_to_the_working_directory(
-    folder, tmp_path_factory, monkeypatch
-):
+def test_paths_are_relative_to_the_file(folder, tmp_path_factory, monkeypatch):
+    """And not to the working directory."""
     (folder / "map.csv").touch()
     (folder / "ranges.toml").touch()
     tables = '[pairing]\nmap = "map.csv"\n[normalize]\nranges = "./ranges.toml"\n'
@@ -96,46 +95,43 @@ def test_lists_of_ids_lie_beside_the_definition(folder):
         assert load_parameters(path).normalize.split_by == rule
 
 
-@pytest.mark.parametrize(
-    ("addition", "words"),
-    [
-        ('[align]\nengin = "field"\n', ("align.engin", "did you mean 'engine'", "radius")),
-        ('[normalize]\nranges = "p99-p1"\n', ("normalize", "p99-p1", "the lower first")),
-        ('[normalize]\nranges = "p1-p101"\n', ("normalize", "p1-p101", "p0 to p100")),
-        ('[normalize]\nranges = "p1-pnan"\n', ("normalize.ranges", "does not exist", "p1-p99")),
-        ('[normalize]\nsplit_by = "pixie"\n', ("normalize", "objects = 'train'")),
-        (f'{TRAIN}ranges = "pixie"\n', ("normalize", "percentiles of it where objects")),
-        (f"{TRAIN}shares = [0.5, 0.5, 0.5]\n", ("normalize", "add up to 1")),
-        (f'{TRAIN}split_by = "no.json"\n', ("normalize.split_by", "no.json", "does not exist")),
-        ('[align]\nengine = "magic"\n', ("align.engine", "'magic'", "'open3d'")),
-        ("[align]\nradius = true\n", ("align.radius", "True", "number")),
-        ('[align]\nradius = "3"\n', ("align.radius", "'3'", "number")),
-        ("[align]\nradius = -1.0\n", ("align.radius", "-1.0", "greater than 0")),
-        ("[align]\nradius = nan\n", ("align.radius", "nan", "finite number")),
-        ("[align]\nscale_bounds = [1.2, 1.6]\n", ("align.scale_bounds.0", "1.2", "or equal to 1")),
-        ("align.radius = 1.5\n", ("slat.align", "unknown key")),
-        ("[alingment]\n", ("alingment", "unknown key", "did you mean 'align'")),
-        ("[store]\ncompression_level = 23\n", ("store.compression_level", "or equal to 22")),
-        ("[store]\nvoxel_chunk = 2000000\n", ("store.voxel_chunk", "equal to 1048576")),
-        ("[store]\nvoxel_chunks_per_shard = 2000000\n", ("per_shard", "equal to 1048576")),
-        ("[store]\nvoxel_chunks_per_shard = 100000\n", ("store: got", "at most 268435456 rows")),
-        ("[store]\ngrid_assets_per_shard = 70000\n", ("store.grid_assets", "equal to 65536")),
-        ("[sample]\nvote_width = 1e300\n", ("sample.vote_width", "equal to 1000")),
-        ("[sample]\nvote_width = 1e-300\n", ("sample.vote_width", "greater than 0")),
-        ("x = " + "[" * 3000 + "]" * 3000, ("not valid TOML", "nested too deeply")),
-        ('[pairing]\nmap = "absent.csv"\n', ("pairing.map", "absent.csv", "does not exist")),
-        ('[normalize]\nranges = "pixi"\n', ("normalize.ranges", "pixi", "dataset, pixie")),
-        ('pattern = "{id}.npz"\n', ("slat.pattern", "'{id}.npz'", "array")),
-        ('"group" = 3\n', ("slat.group", "3", "string")),
-        ('[normalize]\nranges = "\\u0000"\n', ("normalize.ranges", "without NUL")),
-        ('[normalize]\nsplit_by = "\\u0000.json"\n', ("normalize.split_by", "without NUL")),
-        ('[[also]]\nroot = "\\u0000"\n', ("also.[].root", "without NUL")),
-        ("[align]\nicp_iterations = " + "9" * 23 + "\n", ("align.icp_iterations", "23 digits")),
-        ("[align]\nicp_iterations = " + "9" * 5000 + "\n", ("cannot be read", "4300 digits")),
-        (".".join(["a"] * 3000) + " = 1\n", ("nested too deeply",)),
-        ('[pairing]\nmap = "~nobody-here/x"\n', ("pairing.map", "~nobody-here/x")),
-    ],
-)
+@pytest.mark.parametrize(("addition", "words"), [
+    ('[align]\nengin = "field"\n', ("align.engin", "did you mean 'engine'", "radius")),
+    ('[normalize]\nranges = "p99-p1"\n', ("normalize", "p99-p1", "the lower first")),
+    ('[normalize]\nranges = "p1-p101"\n', ("normalize", "p1-p101", "p0 to p100")),
+    ('[normalize]\nranges = "p1-pnan"\n', ("normalize.ranges", "does not exist", "p1-p99")),
+    ('[normalize]\nsplit_by = "pixie"\n', ("normalize", "objects = 'train'")),
+    (f'{TRAIN}ranges = "pixie"\n', ("normalize", "percentiles of it where objects")),
+    (f"{TRAIN}shares = [0.5, 0.5, 0.5]\n", ("normalize", "add up to 1")),
+    (f'{TRAIN}split_by = "no.json"\n', ("normalize.split_by", "no.json", "does not exist")),
+    ('[align]\nengine = "magic"\n', ("align.engine", "'magic'", "'open3d'")),
+    ("[align]\nradius = true\n", ("align.radius", "True", "number")),
+    ('[align]\nradius = "3"\n', ("align.radius", "'3'", "number")),
+    ("[align]\nradius = -1.0\n", ("align.radius", "-1.0", "greater than 0")),
+    ("[align]\nradius = nan\n", ("align.radius", "nan", "finite number")),
+    ("[align]\nscale_bounds = [1.2, 1.6]\n", ("align.scale_bounds.0", "1.2", "or equal to 1")),
+    ("align.radius = 1.5\n", ("slat.align", "unknown key")),
+    ("[alingment]\n", ("alingment", "unknown key", "did you mean 'align'")),
+    ("[store]\ncompression_level = 23\n", ("store.compression_level", "or equal to 22")),
+    ("[store]\nvoxel_chunk = 2000000\n", ("store.voxel_chunk", "equal to 1048576")),
+    ("[store]\nvoxel_chunks_per_shard = 2000000\n", ("per_shard", "equal to 1048576")),
+    ("[store]\nvoxel_chunks_per_shard = 100000\n", ("store: got", "at most 268435456 rows")),
+    ("[store]\ngrid_assets_per_shard = 70000\n", ("store.grid_assets", "equal to 65536")),
+    ("[sample]\nvote_width = 1e300\n", ("sample.vote_width", "equal to 1000")),
+    ("[sample]\nvote_width = 1e-300\n", ("sample.vote_width", "greater than 0")),
+    ("x = " + "[" * 3000 + "]" * 3000, ("not valid TOML", "nested too deeply")),
+    ('[pairing]\nmap = "absent.csv"\n', ("pairing.map", "absent.csv", "does not exist")),
+    ('[normalize]\nranges = "pixi"\n', ("normalize.ranges", "pixi", "dataset, pixie")),
+    ('pattern = "{id}.npz"\n', ("slat.pattern", "'{id}.npz'", "array")),
+    ('"group" = 3\n', ("slat.group", "3", "string")),
+    ('[normalize]\nranges = "\\u0000"\n', ("normalize.ranges", "without NUL")),
+    ('[normalize]\nsplit_by = "\\u0000.json"\n', ("normalize.split_by", "without NUL")),
+    ('[[also]]\nroot = "\\u0000"\n', ("also.[].root", "without NUL")),
+    ("[align]\nicp_iterations = " + "9" * 23 + "\n", ("align.icp_iterations", "23 digits")),
+    ("[align]\nicp_iterations = " + "9" * 5000 + "\n", ("cannot be read", "4300 digits")),
+    (".".join(["a"] * 3000) + " = 1\n", ("nested too deeply",)),
+    ('[pairing]\nmap = "~nobody-here/x"\n', ("pairing.map", "~nobody-here/x")),
+])  # fmt: skip
 def test_fault_is_reported_with_file_key_value_and_what_is_allowed(folder, addition, words):
     path = write(folder, MINIMAL + addition)
     message = message_of(path)

@@ -18,12 +18,8 @@ NEAREST = SampleParameters(method="nearest")
 def _field() -> MaterialField:
     """Two voxels with values of their own."""
     voxels = np.array([[10, 10, 10], [20, 10, 10]], dtype=np.uint8)
-    return MaterialField(
-        occupancy_of(voxels),
-        voxels,
-        np.array([1, 4], dtype=np.uint8),
-        np.array([[2e11, 7800, 0.3], [1e5, 1000, 0.45]], dtype=np.float32),
-    )
+    values = np.array([[2e11, 7800, 0.3], [1e5, 1000, 0.45]], dtype=np.float32)
+    return MaterialField(occupancy_of(voxels), voxels, np.array([1, 4], np.uint8), values)
 
 
 def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
@@ -40,8 +36,7 @@ def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
 
 
 def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values():
-    # One voxel of class 0 in a block of class 3: looked at slightly off its
-    # centre, its neighbours outvote it.
+    # A voxel of class 0 in a block of class 3, outvoted slightly off its centre.
     block = np.argwhere(np.ones((5, 5, 5), dtype=bool)).astype(np.uint8) + 30
     # The voxel to be taken comes first: row 0 is a row as any other.
     block = np.roll(block, -int(np.flatnonzero((block == [31, 32, 32]).all(axis=1))[0]), axis=0)
@@ -61,12 +56,9 @@ def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values():
 def test_labels_alone_are_the_same_labels(method):
     rng = np.random.default_rng(3)
     voxels = np.unique(rng.integers(20, 40, (500, 3)), axis=0).astype(np.uint8)
-    field = MaterialField(
-        occupancy=occupancy_of(voxels),
-        voxels=voxels,
-        material=rng.integers(0, 7, len(voxels)).astype(np.uint8),
-        properties=rng.random((len(voxels), 3), dtype=np.float32),
-    )
+    classes = rng.integers(0, 7, len(voxels)).astype(np.uint8)
+    values = rng.random((len(voxels), 3), dtype=np.float32)
+    field = MaterialField(occupancy_of(voxels), voxels, classes, values)
     places = rng.uniform(-0.6, 0.6, (4000, 3))
     parameters = SampleParameters(method=method, max_distance=2.3)
     whole = sample(field, places, parameters)

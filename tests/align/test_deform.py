@@ -38,9 +38,7 @@ def pair(move: Move) -> tuple[MaterialField, StructuredLatents]:
 def mistakes(alignment: Alignment, latents: StructuredLatents, move: Move) -> np.ndarray:
     """Return how far, in voxels, each SLAT voxel is looked up from where it lies."""
     places = map_of(alignment).places(latents.coords)
-    return np.asarray(
-        np.linalg.norm(places - move(voxel_centres(latents.coords)), axis=1) * 64, dtype=np.float64
-    )
+    return np.linalg.norm(places - move(voxel_centres(latents.coords)), axis=1) * 64
 
 
 def test_a_known_bend_is_found_and_the_order_of_voxels_does_not_change_a_bit():
@@ -119,8 +117,7 @@ def test_the_same_shape_is_not_deformed():
 
 
 def test_a_tie_is_one_only_if_both_fit_once_deformed():
-    # A bar with a small fin near one end, and the same bar bent: end for end the bend hides
-    # the fin from every similarity, but none the fin from what is bent back.
+    # A bar with a small fin near one end: bent, the fin is hidden from every similarity.
     def bar(points: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(points, -1, 0)
         body = (abs(x) < 22) & (abs(y) < 6) & (abs(z) < 8)
@@ -215,10 +212,7 @@ def stretched(
 
 @pytest.fixture(scope="module")
 def beside() -> tuple[Surface, Surface, Similarity, NDArray[np.float64]]:
-    """Two sides beside each other, of other sizes, and a map that is nowhere along an axis.
-
-    The samples fill no whole number of blocks, and some lie outside the other's box.
-    """
+    """Two sides of other sizes beside each other, some samples outside, and any affine map."""
     slat = surface_of(crate(CENTRES - [3, -2, 4])).subset(150)
     pixie = surface_of(crate((CENTRES - [-2, -5, 1]) / 0.8)).subset(200)
     turn = Rotation.from_euler("xyz", [25, -40, 70], degrees=True).as_matrix()
@@ -240,10 +234,7 @@ def test_without_a_step_the_score_is_the_mean_kernel_of_both_sides(beside):
 
 @pytest.mark.parametrize("tau", [1.5, 5.0])
 def test_a_step_is_that_of_least_squares_on_numerical_derivatives(beside, tau):
-    """Of Gauss and Newton, with the weights of Geman and McClure and two small priors.
-
-    Of samples within the other's box, as of others the search knows an approximate derivative.
-    """
+    """Of Gauss and Newton, with Geman's and McClure's weights; of samples in the other's box."""
     slat, pixie, pose, affine = beside
     there, here = carried(slat, pixie, pose, affine)
     forward, backward = within_box(pixie, there), within_box(slat, here)
@@ -284,12 +275,8 @@ def test_poses_are_stretched_each_by_itself(beside):
     other = pose._replace(shift=pose.shift + 2.0, scale=1.1, offset=-0.1)
     affines, poses = np.stack([np.eye(3, 4), affine]), Poses.of([other, pose])
     scores = stretch(slat.samples, pixie.samples, poses, affines, np.array([4.0, 2.0]))
-    for k, alone in enumerate(
-        [
-            stretched(slat, pixie, other, np.eye(3, 4), 4.0, 2.0),
-            stretched(slat, pixie, pose, affine, 4.0, 2.0),
-        ]
-    ):
+    for k, one in enumerate(((other, np.eye(3, 4)), (pose, affine))):
+        alone = stretched(slat, pixie, *one, 4.0, 2.0)
         np.testing.assert_array_equal(affines[k], alone[0])
         assert (poses.offsets[k], scores[k]) == alone[1:]
 

@@ -166,12 +166,10 @@ def test_a_placement_that_is_taken_is_fitted_without_the_ground():
     field, latents = field_of(chair() | slab(3.0)), surface_latents(larger(chair(), 1.2))
     found = align(field, latents, DEFAULT)
     elsewhere = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
-    other = replace(
-        found, transform=elsewhere, placements=(Placement(found.transform, found.score, 20.0),)
-    )
-    settled = refit(
-        take(other, 0, latents, LatentChoice(0.99, 12.0, 300, 40, 40)), field, latents, DEFAULT
-    )
+    first = Placement(found.transform, found.score, 20.0)
+    other = replace(found, transform=elsewhere, placements=(first,))
+    taken = take(other, 0, latents, LatentChoice(0.99, 12.0, 300, 40, 40))
+    settled = refit(taken, field, latents, DEFAULT)
     assert settled.ground is found.ground
     assert displacement(settled.transform, found.transform, latents.centres) < 0.2
     assert settled.quality.fitness == pytest.approx(found.quality.fitness, abs=0.01)

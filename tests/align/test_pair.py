@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from support.deformed import occupancy
 from support.residuals import mean_kernel, residuals
 from support.shapes import GRID, chair, crate
 
+from slatprep.align import search
 from slatprep.align.consensus import degrees_between
 from slatprep.align.finish import MOST_CONTESTED, finish
 from slatprep.align.pair import (
@@ -26,15 +27,6 @@ from slatprep.align.pair import (
     far_apart,
 )
 from slatprep.align.pose import Pose, Similarity
-from slatprep.align.search import (
-    MOST_RANKED,
-    RANK_WITHIN,
-    SO3_KEPT,
-    SO3_STARTS,
-    ranked,
-    search_all,
-    stretched,
-)
 from slatprep.align.starts import distinct_starts
 from slatprep.align.surface import Surface, surface_of
 from slatprep.parameters import AlignParameters
@@ -47,27 +39,24 @@ def ball(radius: float) -> NDArray[np.bool_]:
     return inside
 
 
-def placed(
-    scale: float, rotation: Array | None = None, at: tuple[float, ...] = (0, 0, 0)
-) -> NDArray[np.bool_]:
+Solid = NDArray[np.bool_] | None
+UPRIGHT, DEFAULT = np.eye(3), AlignParameters()
+
+
+def placed(scale: float, turn: Array = UPRIGHT, at: tuple[float, ...] = (0, 0, 0)) -> Solid:
     """Return a solid without any symmetry, scaled and turned about the cube's centre and moved."""
-    turn = np.eye(3) if rotation is None else rotation
     return occupancy(lambda points: (points - np.array(at) / 64) @ turn / scale)
 
 
-@lru_cache(maxsize=1)
+@cache
 def chair_surface() -> Surface:
     return surface_of(chair())
 
 
-def pair_of(
-    slat: NDArray[np.bool_] | None = None,
-    pixie: NDArray[np.bool_] | None = None,
-    parameters: AlignParameters | None = None,
-) -> Pair:
+def pair_of(slat: Solid = None, pixie: Solid = None, parameters: AlignParameters = DEFAULT) -> Pair:
     """Return a pair of two solids, each a chair where nothing else is given."""
-    surfaces = [chair_surface() if solid is None else surface_of(solid) for solid in (slat, pixie)]
-    return Pair(*surfaces, parameters or AlignParameters())
+    surfaces = (chair_surface() if solid is None else surface_of(solid) for solid in (slat, pixie))
+    return Pair(*surfaces, parameters)
 
 
 def moved_by(*shift: float, score: float = 0.0) -> Pose:
@@ -126,10 +115,7 @@ def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places():
 
 
 def test_a_repeated_placement_is_dropped_for_the_better_one():
-    """Shifts are as far apart as they say; the second repeats the first, and the third the second.
-
-    What is dropped drops no other: the third does not lie near to one that is kept.
-    """
+    """What is dropped drops no other: the third lies near the second, and to none that is kept."""
     pair = pair_of(ball(12.0))
     first, second, third = (
         moved_by(x, 0.0, 0.0, score=score) for x, score in ((0, 0.9), (1.2, 0.8), (2.4, 0.7))
@@ -172,18 +158,17 @@ def test_the_size_of_a_start_is_that_of_the_sides_within_its_bounds():
 def test_scale_is_refined_only_where_it_is_free():
     turn = Rotation.from_euler("x", 4, degrees=True).as_matrix()
     start = Pose(Similarity(turn, np.ones(3), 1.06))
-    for model, free, held in (
-        ("auto", None, False), ("auto", False, True), ("rigid", None, True), ("rigid", True, False),
-    ):  # fmt: skip
+    for model, free, held in (("auto", None, False), ("auto", False, True),
+                              ("rigid", None, True), ("rigid", True, False)):  # fmt: skip
         pair = pair_of(parameters=AlignParameters(model=model))
         (found,) = pair.refine([start], 400, (4.0,) * 8, 1e-4, free_scale=free)
-        assert found.similarity.scale == pytest.approx(
-            1.06 if held else 1.0, abs=0.0 if held else 0.01
-        )
-        if not held:
-            assert off(pair, found, moved_by(0, 0, 0)) < 0.1
-            assert found.score == pytest.approx(1.0, abs=0.02)
-            assert found.fitness == 1.0
+        if held:
+            assert found.similarity.scale == 1.06
+            continue
+        assert found.similarity.scale == pytest.approx(1.0, abs=0.01)
+        assert off(pair, found, moved_by(0, 0, 0)) < 0.1
+        assert found.score == pytest.approx(1.0, abs=0.02)
+        assert found.fitness == 1.0
 
 
 def test_the_score_is_the_mean_kernel_of_both_sides():
@@ -253,15 +238,12 @@ def scattered(scores: Array) -> list[Pose]:
     return [moved_by(*place, score=s) for place, s in zip(places, scores, strict=False)]
 
 
-@pytest.mark.parametrize(
-    ("scores", "survive"),
-    [
-        (np.linspace(0.9, 0.1, 12), SURVIVORS),
-        ([0.9, 0.88, 0.87, 0.86, 0.85, 0.845, 0.83, 0.5], 6),
-        (np.full(40, 0.9), MOST_SURVIVORS),
-        ([0.9, 0.2], 2),
-    ],
-)
+@pytest.mark.parametrize(("scores", "survive"), [
+    (np.linspace(0.9, 0.1, 12), SURVIVORS),
+    ([0.9, 0.88, 0.87, 0.86, 0.85, 0.845, 0.83, 0.5], 6),
+    (np.full(40, 0.9), MOST_SURVIVORS),
+    ([0.9, 0.2], 2),
+])  # fmt: skip
 def test_what_is_polished_is_likely_or_among_the_first(scores, survive):
     """Six of the second are within twice `TIE` of its best one."""
     assert pytest.approx(0.03) == TIE
@@ -272,18 +254,15 @@ def test_what_is_polished_is_likely_or_among_the_first(scores, survive):
 
 @pytest.mark.parametrize("stray", [False, True])
 def test_all_orientations_are_searched_and_a_stray_part_does_not_hide_the_placement(stray):
-    """Sizes say another scale with it; half as many starts are made at scale one beside them.
-
-    The likely half of all is searched to the end.
-    """
+    """Sizes say another scale with it; half as many starts at scale one are made beside them."""
     turn = Rotation.from_euler("xyz", [40, 25, -70], degrees=True).as_matrix()
     other = placed(0.6)
     other[56:63, 56:63, 2:9] |= stray
     pair = watched(pair_of(placed(0.6, turn), other))
-    refined, halfway = search_all(pair)
-    supplement = [SO3_STARTS // 2] * stray
-    assert pair.refined == [SO3_STARTS, *supplement, SO3_KEPT]
-    assert (len(refined), len(halfway)) == (SO3_KEPT, SO3_STARTS)
+    refined, halfway = search.search_all(pair)
+    supplement = [search.SO3_STARTS // 2] * stray
+    assert pair.refined == [search.SO3_STARTS, *supplement, search.SO3_KEPT]
+    assert (len(refined), len(halfway)) == (search.SO3_KEPT, search.SO3_STARTS)
     scores = [pose.score for pose in halfway]
     assert scores == sorted(scores, reverse=True)
     best = max(refined, key=lambda pose: pose.score)
@@ -297,7 +276,7 @@ def test_all_orientations_are_searched_and_a_stray_part_does_not_hide_the_placem
 
 def test_of_rigid_poses_none_gets_a_scale():
     pair = pair_of(placed(0.8), placed(1.0), parameters=AlignParameters(model="rigid"))
-    refined, halfway = search_all(pair)
+    refined, halfway = search.search_all(pair)
     assert {pose.similarity.scale for pose in [*refined, *halfway]} == {1.0}
 
 
@@ -333,8 +312,8 @@ def squashed() -> tuple[Pair, list[Pose]]:
 def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(squashed):
     pair, poses = squashed
     assert upright(poses[0]) > 60.0
-    _, halfway = search_all(pair)
-    found = ranked(pair, poses, halfway)
+    _, halfway = search.search_all(pair)
+    found = search.ranked(pair, poses, halfway)
     assert upright(found[0]) < 10.0
     assert found[0].score < poses[0].score - 0.1
     ranks = [pose.rank for pose in found]
@@ -344,7 +323,8 @@ def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(squ
     assert standing.standing == RANK_STANDING
     assert off(pair, standing, poses[0]) == 0.0
     # What was not tried keeps its score; it was no more than six, within a bound.
-    near = [pose for pose in poses if pose.score > poses[0].score - RANK_WITHIN][:MOST_RANKED]
+    least = poses[0].score - search.RANK_WITHIN
+    near = [pose for pose in poses if pose.score > least][: search.MOST_RANKED]
     beyond = poses[len(near) :]
     assert {id(pose) for pose in found if pose.bonus == 0.0} <= set(map(id, beyond))
     for pose in beyond:
@@ -353,9 +333,9 @@ def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(squ
 
 def test_what_is_far_below_the_best_fit_is_not_tried(squashed):
     pair, all_poses = squashed
-    scores = (0.65, 0.56, 0.65 - RANK_WITHIN - 0.01)
+    scores = (0.65, 0.56, 0.65 - search.RANK_WITHIN - 0.01)
     poses = [replace(p, score=s) for p, s in zip(all_poses[::2], scores, strict=False)]
-    found = ranked(pair, poses, poses[:1])
+    found = search.ranked(pair, poses, poses[:1])
     assert found[-1] is poses[2]
     assert all(pose.bonus > 0.0 for pose in found[:-1])
 
@@ -368,8 +348,8 @@ def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(squas
         replace(best, similarity=best.similarity._replace(rotation=turn @ best.similarity.rotation))
         for turn in turns
     ]
-    better = next(b for b in beside if stretched(pair, [best, b], [best]) == [b])
-    found = ranked(pair, [best, better], [best])
+    better = next(b for b in beside if search.stretched(pair, [best, b], [best]) == [b])
+    found = search.ranked(pair, [best, better], [best])
     assert any(off(pair, pose, best) == 0.0 for pose in found)
 
 

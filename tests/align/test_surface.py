@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.shapes import GRID, aligned, chair, field_of, surface_latents
+from support.shapes import GRID, chair, field_of, latents_of, surface_latents
 
 from slatprep.align.quality import compare, measure_quality
 from slatprep.align.starts import candidates_of, distinct_starts, euler_starts, so3_starts
 from slatprep.align.surface import BAND, CENTRE, DILATION, surface_of
 from slatprep.geometry.frames import make_transform
 from slatprep.geometry.voxels import boundary, filled, voxels_of
-from slatprep.judge import THRESHOLDS, verdict_of
-from slatprep.records import Ambiguity, Judgement, Quality, Verdict
 
 
 def test_a_shell_and_its_solid_have_the_same_surface():
@@ -89,9 +87,8 @@ def test_starts_are_scipy_s_euler_rotations():
     for start in euler_starts():
         expected = Rotation.from_euler("xyz", start.euler_degrees, degrees=True).as_matrix()
         np.testing.assert_allclose(start.rotation, expected, atol=1e-12)
-    assert [s.euler_degrees for s in euler_starts()][:5] == [
-        (0, 0, 0), (0, 0, 90), (0, 0, 180), (0, 0, 270), (0, 90, 0),
-    ]  # fmt: skip
+    first = [(0, 0, 0), (0, 0, 90), (0, 0, 180), (0, 0, 270), (0, 90, 0)]
+    assert [start.euler_degrees for start in euler_starts()][:5] == first
 
 
 def test_of_64_starts_24_are_different_and_the_others_name_their_twin():
@@ -107,13 +104,9 @@ def test_of_64_starts_24_are_different_and_the_others_name_their_twin():
 
 def test_the_distinct_starts_are_the_rotation_group_of_the_cube():
     keys = {tuple(start.rotation.ravel()) for start in distinct_starts()}
-    products = {
-        tuple((a.rotation @ b.rotation).ravel())
-        for a in distinct_starts()
-        for b in distinct_starts()
-    }
-    assert products == keys
-    assert all(np.linalg.det(start.rotation) > 0 for start in distinct_starts())
+    turns = [start.rotation for start in distinct_starts()]
+    assert {tuple((a @ b).ravel()) for a in turns for b in turns} == keys
+    assert all(np.linalg.det(turn) > 0 for turn in turns)
 
 
 def test_repeated_candidates_carry_the_scores_of_their_twin():
@@ -150,37 +143,18 @@ LINE = np.array([[i, 30, 30] for i in range(10)], dtype=np.uint8)
 
 
 def test_a_shift_along_a_line_by_hand():
-    # Ten voxels in a row, carried three and a half voxels along: six have a
-    # partner half a voxel away, the seventh lies half a voxel past the end.
-    transform = make_transform(np.eye(3), [3.5 / 64, 0, 0])
-    quality = compare(LINE, LINE, transform, radius=1.0)
-    assert quality.fitness == pytest.approx(0.7)
-    assert quality.fitness_backward == pytest.approx(0.7)
+    # Ten voxels in a row, three and a half along: six have a partner, and so has one past the end.
+    quality = compare(LINE, LINE, make_transform(np.eye(3), [3.5 / 64, 0, 0]), radius=1.0)
+    shares = quality.fitness, quality.fitness_backward, quality.overlap
+    assert shares == pytest.approx((0.7, 0.7, 0.7))
     assert quality.inlier_rmse == pytest.approx(0.5)
-    assert quality.overlap == pytest.approx(0.7)
 
 
-def test_distances_are_in_voxels_of_the_slat_frame():
-    # Twice as large about the cube's centre: neighbours stand two voxels apart,
-    # so every second SLAT voxel is half a voxel from a carried one's centre.
-    pixieverse = np.array([[i, 31, 31] for i in range(28, 36)], dtype=np.uint8)
-    slat = np.array([[i, 31, 31] for i in range(24, 40)], dtype=np.uint8)
-    quality = compare(pixieverse, slat, make_transform(np.eye(3), scale=2.0), radius=1.0)
-    # (i + 0.5 - 32) * 2 + 32 - 0.5 = 2 i - 31.5: half-way between two in x, and
-    # in y and z 31 -> 30.5, half a voxel off the row.
-    expected = np.sqrt(3 * 0.25)
-    assert quality.inlier_rmse == pytest.approx(expected)
-    assert quality.inlier_rmse_backward == pytest.approx(expected)
-    assert quality.fitness == quality.fitness_backward == 1.0
-
-
-def test_the_radius_is_in_voxels_of_the_slat_frame_both_ways():
-    # One PixieVerse voxel off is half a SLAT voxel at this scale, and three are one and a half.
+def test_radius_and_distances_are_in_voxels_of_the_slat_frame_both_ways():
+    # A PixieVerse voxel and a half is 0.75 of a SLAT voxel at this scale, and three are 1.5.
     pixieverse = np.array([[32, 32, 32]], dtype=np.uint8)
-    for off, near in ((1, 1.0), (3, 0.0)):
-        transform = make_transform(
-            np.eye(3), [0.5 * off / 64 + 0.25 / 64, 0.25 / 64, 0.25 / 64], 0.5
-        )
+    for off, near in ((1.5, 1.0), (3, 0.0)):
+        transform = make_transform(np.eye(3), np.array([0.5 * off + 0.25, 0.25, 0.25]) / 64, 0.5)
         quality = compare(pixieverse, pixieverse, transform, radius=1.0)
         assert (quality.fitness, quality.fitness_backward) == (near, near)
         rmse = quality.inlier_rmse, quality.inlier_rmse_backward
@@ -195,30 +169,7 @@ def test_far_sets_have_no_inlier_and_no_nan():
 def test_voxels_inside_the_slat_do_not_count_against_it():
     solid = chair()
     latents = surface_latents(solid)
-    inner = np.array([[30, 30, 25]], dtype=np.uint8)  # a wall between two parts
-    crowded = type(latents)(
-        np.concatenate([latents.coords, inner]), np.zeros((len(latents.coords) + 1, 8), np.float32)
-    )
+    crowded = latents_of(np.vstack([latents.coords, [[30, 30, 25]]]))  # a wall between two parts
     for either in (latents, crowded):
         quality = measure_quality(field_of(solid), either, np.eye(4), 1.0)
         assert quality.fitness == quality.fitness_backward == quality.overlap == 1.0
-
-
-@pytest.mark.parametrize(
-    ("fitness", "backward", "verdict", "word"),
-    [
-        (THRESHOLDS.good_fitness, 1.0, Verdict.GOOD, ""),
-        (0.79, 1.0, Verdict.DOUBTFUL, "PixieVerse boundary"),
-        (1.0, 0.79, Verdict.DOUBTFUL, "SLAT boundary"),
-        (1.0, 0.64, Verdict.FAILED, "SLAT boundary"),
-        (THRESHOLDS.failed_fitness, 1.0, Verdict.DOUBTFUL, ""),
-        (0.64, 1.0, Verdict.FAILED, "64.0%"),
-    ],
-)
-def test_verdicts_by_fitness_alone(fitness, backward, verdict, word):
-    quality, twice = Quality(fitness, 0.5, backward, 0.5, 0.9, 1.0), [np.eye(4)] * 2
-    unknown = Judgement(Ambiguity(0.05, (0.0,)), Verdict.GOOD)
-    given, reasons = verdict_of(aligned(*twice, quality=quality), unknown, 1.0)
-    assert given is verdict
-    assert word in " ".join(reasons)
-    assert bool(reasons) == (verdict is not Verdict.GOOD)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zarr
 from support.commands import document, refused, run
 from support.made_store import rewrite
 from support.predictions import write_predictions
@@ -45,15 +44,12 @@ def of_kinds(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "s.zarr"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("check-alignment", "--store", "STORE", "--asset", "NOBODY", "--picture", "none"),
-        ("export", "STORE", "--asset", "NOBODY", "--format", "npz", "--out", "OUT"),
-        ("subset", "STORE", "--asset", "NOBODY", "--out", "OUT"),
-        ("transfer", "POINTS", "--store", "STORE", "--asset", "NOBODY", "--out", "OUT"),
-    ],
-)
+@pytest.mark.parametrize("words", [
+    ("check-alignment", "--store", "STORE", "--asset", "NOBODY", "--picture", "none"),
+    ("export", "STORE", "--asset", "NOBODY", "--format", "npz", "--out", "OUT"),
+    ("subset", "STORE", "--asset", "NOBODY", "--out", "OUT"),
+    ("transfer", "POINTS", "--store", "STORE", "--asset", "NOBODY", "--out", "OUT"),
+])  # fmt: skip
 def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tmp_path):
     np.save(tmp_path / "p.npy", np.zeros((3, 3), np.float32))
     places = {"STORE": store, "OUT": tmp_path / "out", "POINTS": tmp_path / "p.npy"}
@@ -65,33 +61,40 @@ def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tm
         assert said in refused(*given)
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        ("evaluate --store nothing-here", 2, "nothing-here"),
-        ("build-store --pixieverse . --slat .", 2, "Missing option '--out'"),
-        ("align --out NEW", 2, "pixieverse.root: not given"),
-        ("make-demo NEW --level 8", 2, "8 is not in the range"),
-        ("make-demo d --assets 0", 2, "0 is not in the range"),
-        ("info --colour", 2, "No such option '--colour'"),
-        ("score STORE", 2, "Missing argument 'TRUTH_DIR'"),
-        ("stats STORE --weight x", 2, "'x' is not one of 'voxel', 'asset'"),
-        ("info FOLDER", 1, "FOLDER is not a slatprep store"),
-        ("check-alignment --asset cuo --store STORE", 2, "did you mean cup?"),
-        ("check-alignment --store STORE", 2, "say which assets"),
-        ("report STORE --out s3://nowhere/p.html", 2, "expected a path of the local"),
-        ("subset STORE --verdict good --out memory://s.zarr", 2, "gone when the command ends"),
-        ("verify FOLDER", 1, "FOLDER is not a slatprep store"),
-        ("train STORE --out NEW --learning-rate nan", 2, "nan is no finite number"),
-        ("train STORE --out NEW --learning-rate inf", 2, "inf is no finite number"),
-        ("train STORE --out NEW --max-ambiguity nan", 2, "nan is no finite number"),
-        ("make-demo NEW --habitual-share nan", 2, "nan is no finite number"),
-        ("measure-errors STORE --seed -1", 2, "-1 is not in the range"),
-        ("train STORE --out NEW --seed -1", 2, "-1 is not in the range"),
-        ("align --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below GRIDS"),
-        ("build-store --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below"),
-    ],
-)
+@pytest.mark.parametrize(("words", "code", "said"), [
+    ("evaluate --store nothing-here", 2, "nothing-here"),
+    ("build-store --pixieverse . --slat .", 2, "Missing option '--out'"),
+    ("align --out NEW", 2, "pixieverse.root: not given"),
+    ("make-demo NEW --level 8", 2, "8 is not in the range"),
+    ("make-demo d --assets 0", 2, "0 is not in the range"),
+    ("info --colour", 2, "No such option '--colour'"),
+    ("score STORE", 2, "Missing argument 'TRUTH_DIR'"),
+    ("stats STORE --weight x", 2, "'x' is not one of 'voxel', 'asset'"),
+    ("info FOLDER", 1, "FOLDER is not a slatprep store"),
+    ("check-alignment --asset cuo --store STORE", 2, "did you mean cup?"),
+    ("check-alignment --store STORE", 2, "say which assets"),
+    ("report STORE --out s3://nowhere/p.html", 2, "expected a path of the local"),
+    ("subset STORE --verdict good --out memory://s.zarr", 2, "gone when the command ends"),
+    ("verify FOLDER", 1, "FOLDER is not a slatprep store"),
+    ("train STORE --out NEW --learning-rate nan", 2, "nan is no finite number"),
+    ("train STORE --out NEW --learning-rate inf", 2, "inf is no finite number"),
+    ("train STORE --out NEW --max-ambiguity nan", 2, "nan is no finite number"),
+    ("make-demo NEW --habitual-share nan", 2, "nan is no finite number"),
+    ("measure-errors STORE --seed -1", 2, "-1 is not in the range"),
+    ("train STORE --out NEW --seed -1", 2, "-1 is not in the range"),
+    ("align --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below GRIDS"),
+    ("build-store --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below"),
+    # Numbers beyond reason, and words in place of numbers.
+    ("build-store --rehash nan", 2, "Invalid value for '--rehash'"),
+    (f"measure-errors --seed {10**26}", 2, "Invalid value for '--seed'"),
+    (f"train --batch-size {10**22}", 2, "Invalid value for '--batch-size'"),
+    (f"extract-slat --seed {2**32}", 2, "Invalid value for '--seed'"),
+    ("list --max-confidence nan", 2, "Invalid value for '--max-confidence'"),
+    ("build-store --jobs two", 2, "'two' is no whole number; expected a whole number of"),
+    ("make-demo d --level x", 2, "expected a whole number of at least 0 and at most 7"),
+    ("simulate --height x", 2, "'x' is no number; expected a number of at least 0"),
+    ("build-store --jobs 0", 2, "0 is not in the range x>=1"),
+])  # fmt: skip
 def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tmp_path):
     places = {"STORE": store, "FOLDER": tmp_path, "NEW": tmp_path / "new"}
     places |= {"SLAT": mixed.root / "slat", "GRIDS": mixed.root / "pixieverse"}
@@ -100,38 +103,14 @@ def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tm
     command, *rest = words.split()
     result = run(command, "--json", *rest, code=code)
     told = json.loads(result.stdout)
-    assert said in told["error"] and said in result.stderr
+    assert said in told["error"] and said in " ".join(result.stderr.split())
     assert (told["command"], told["ok"]) == (command, False)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("build-store", "--rehash", "nan"),
-        ("measure-errors", "--seed", 10**26),
-        ("train", "--batch-size", 10**22),
-        ("extract-slat", "--seed", 2**32),
-        ("list", "--max-confidence", "nan"),
-    ],
-)
-def test_numbers_beyond_reason_are_refused(words):
-    assert f"Invalid value for '{words[1]}'" in refused(*words)
 
 
 def test_a_misspelt_command_is_told_with_the_one_meant():
     assert "did you mean check-alignment?" in refused("chek-alignment", "--worst", "3")
     refused("xyzzy")
-
-
-@pytest.mark.parametrize(("words", "said"), [
-    (("build-store", "--jobs", "two"), "'two' is no whole number; expected a whole number of"),
-    (("make-demo", "d", "--level", "x"), "expected a whole number of at least 0 and at most 7"),
-    (("simulate", "--height", "x"), "'x' is no number; expected a number of at least 0"),
-    (("build-store", "--jobs", "0"), "0 is not in the range x>=1"),
-])  # fmt: skip
-def test_a_word_in_place_of_a_number_is_told_with_what_is_expected(words, said):
-    assert said in " ".join(refused(*words).split())
 
 
 def test_no_default_is_printed_of_an_option_that_is_empty_without_it():
@@ -153,15 +132,12 @@ def test_names_that_were_looked_for_are_told_once(make_dataset, tmp_path):
     assert told.count("looked for") == 1
 
 
-def test_a_misspelt_folder_is_told_with_the_one_meant(make_dataset, tmp_path):
+def test_a_folder_that_is_not_there_is_told_with_those_that_are(make_dataset, tmp_path):
     root = make_dataset("a").root
-    words = "--pixieverse", root / "pixeverse", "--slat", root / "slat", "--out", tmp_path / "s"
-    assert f"did you mean {root}/pixieverse?" in refused("build-store", *words)
-
-
-def test_what_catalogues_ask_for_is_named_where_it_is_not_stated(store):
-    told = run("describe", store, "--license", "https://spdx.org/licenses/MIT")
-    assert "also ask for --cite-as, --url, --date-published" in told.stderr
+    words = "build-store", "--slat", root / "slat", "--out", tmp_path / "s", "--pixieverse"
+    assert f"did you mean {root}/pixieverse?" in refused(*words, root / "pixeverse")
+    told = refused(*words, root / "absent")
+    assert "option --pixieverse: " in told and f"{root} does, and holds the folders " in told
 
 
 def test_a_category_with_the_name_of_another_row_is_in_quotes(store, copy, tmp_path):
@@ -198,28 +174,13 @@ def test_a_table_of_categories_is_asked_for_unless_it_was_given(store, of_kinds)
     assert "no category is known" in refused("list", store, "--category", "cup")
 
 
-def test_ambiguous_means_the_same_wherever_it_is_counted(store, tmp_path):
-    copied = tmp_path / "copy.zarr"
-    run("subset", store, "--verdict", "good", "--out", copied, "-q")
-    zarr.open_group(copied, mode="r+")["asset/ambiguity"][:] = [0.0, 0.2, 0.9, 0.05, 0.01]
-    assert "\nambiguous: 2 of 5: other placements" in run("info", copied).stdout
-    drawn = document("check-alignment", "--store", copied, "--ambiguous", "--picture", "none")
-    assert [one["asset_id"] for one in drawn["assets"]] == ["bear.side", "bear.front"]
-
-
-@pytest.mark.parametrize(
-    ("place", "named"),
-    [
-        ("s3://b/x.zarr/versions/0123456789abcdef", "s3://b/x.zarr"),
-        ("/d/versions/0123456789abcdef", "/d/versions/0123456789abcdef"),
-    ],
-)
-def test_advice_names_the_store_and_not_a_version_that_is_removed_later(
-    store, place, named, capsys
-):
+@pytest.mark.parametrize("place", ["s3://b/x.zarr", "/d"])
+def test_advice_names_the_store_and_not_a_version_removed_later(store, place, capsys):
+    version = f"{place}/versions/0123456789abcdef"
+    named = place if "://" in place else version
     overview = overview_of(open_store(store))
     total = replace(overview.total, verdicts={"good": 0, "doubtful": 1, "failed": 0}, ambiguous=1)
-    show_quality(Output(), replace(overview, store=place_of(place), total=total), advise=False)
+    show_quality(Output(), replace(overview, store=place_of(version), total=total), advise=False)
     lines = capsys.readouterr().out.splitlines()
     advice = {line.partition(":")[0]: line.split()[1:] for line in lines if " slatprep " in line}
     assert advice["why"] == ["slatprep", "list", named, "--verdict", "doubtful"]
@@ -327,9 +288,8 @@ def test_a_folder_that_takes_nothing_is_a_line(store):
 # -- where `verify` looks for records -------------------------------------------
 
 
-def test_the_records_that_make_left_are_found_and_those_of_another_build_are_not(
-    mixed_build, deformed_build, tmp_path, monkeypatch
-):
+def test_records_that_make_left_are_found(mixed_build, deformed_build, tmp_path, monkeypatch):
+    """Unless they are those of another build."""
     monkeypatch.chdir(tmp_path)
     store = Path(shutil.copytree(str(mixed_build.store), "data/demo.zarr"))
     shutil.copytree(mixed_build.records.parent, "manifests/build/demo")

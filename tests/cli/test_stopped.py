@@ -48,14 +48,11 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return made
 
 
-@pytest.mark.parametrize(
-    ("step", "number"),
-    [
-        *((step, signal.SIGTERM) for step in (*BEFORE, *AFTER)),
-        ("asset begun", signal.SIGINT),
-        ("store replaced", signal.SIGINT),
-    ],
-)
+@pytest.mark.parametrize(("step", "number"), [
+    *((step, signal.SIGTERM) for step in (*BEFORE, *AFTER)),
+    ("asset begun", signal.SIGINT),
+    ("store replaced", signal.SIGINT),
+])  # fmt: skip
 def test_a_signal_at_a_step(step, number, sources, tmp_path):
     folder = Path(shutil.copytree(sources.root / "stores", tmp_path / "stores"))
     out = folder / "s.zarr"
@@ -65,9 +62,8 @@ def test_a_signal_at_a_step(step, number, sources, tmp_path):
         "build-store", "--pixieverse", str(sources.root / "pixieverse"),
         "--slat", str(sources.root / "slat"), "--ranges", "pixie", "--out", str(out),
     ]  # fmt: skip
-    forked = multiprocessing.get_context("fork").Process(
-        target=_run, args=(step, number, line, said)
-    )
+    how = {"target": _run, "args": (step, number, line, said)}
+    forked = multiprocessing.get_context("fork").Process(**how)
     forked.start()
     forked.join()
     assert forked.exitcode == 130

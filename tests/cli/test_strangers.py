@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from click.testing import Result
 from support.commands import document, refused, run
@@ -149,25 +148,6 @@ def test_a_report_of_unknown_words_is_refused(store, name):
     rewrite(store, f"asset/{name}", 0, "other")
     told = refused("report", store, "--out", store.with_suffix(".html"), code=1)
     assert "'other' is none of" in told
-
-
-TRUTH: dict[str, dict[str, Any]] = {
-    "singular": {"transform": np.zeros((4, 4))},
-    "no numbers": {"transform": np.full((4, 4), np.nan)},
-    "misshaped": {"transform": np.eye(3)},
-    "text": {"material": np.full(7, "x")},
-    "objects": {"name": np.array([{}], object)},
-    "list of levels": {"level": np.arange(3)},
-    "places nowhere": {"places": np.full((7, 3), np.nan)},
-}
-
-
-@pytest.mark.parametrize("case", TRUTH)
-def test_truth_that_is_none(store, tmp_path, case):
-    sound = {"transform": np.eye(4), "material": np.zeros(7, np.uint8), "name": "a", "level": 0}
-    (tmp_path / "truth").mkdir()
-    np.savez(tmp_path / "truth/cup.npz", **({**sound, "symmetric": False} | TRUTH[case]))
-    assert "cup.npz" in refused("score", store, tmp_path / "truth", code=1)
 
 
 def test_a_category_with_the_space_of_all_costs_no_memory(store):

@@ -107,9 +107,8 @@ def test_pictures_and_errors_beside_a_store_go_through_no_link(folder):
 
 def test_sources_of_a_dataset_definition_are_not_overwritten(folder):
     definition = folder / "d.toml"
-    definition.write_text(
-        '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
-    )
+    text = '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
+    definition.write_text(text)
     before = tree(folder)
     for name in ("d.toml", "sources/slat/a.npz", "s.manifests/build.json"):
         run(f"align --config @d.toml --out @{name}", folder, code=2)

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import (
-    binary_erosion,
-    binary_fill_holes,
-    distance_transform_edt,
-    generate_binary_structure,
-    label,
-    map_coordinates,
-)
+from scipy import ndimage
 from scipy.optimize import least_squares, root
 from scipy.spatial import cKDTree
 
@@ -58,11 +51,11 @@ def test_quarter_turn_is_an_exact_permutation_of_the_axes(index):
     assert any(np.allclose(turn, quarter, atol=1e-12) for quarter in QUARTER_TURNS)
     assert np.allclose(made.views[0].transform[:3, 3], 0, atol=1e-12)
     surface = occupancy_of(np.rint((looked_up(made.views[0]) + 0.5) * 64 - 0.5).astype(int))
-    # The filled grid holds every surface voxel, and whatever of it is not one
-    # lies inside: no face of it is bare.
+    # The filled grid holds every surface voxel, and no face of what is not one is bare.
     assert not np.any(surface & ~made.occupancy)
     padded = np.pad(made.occupancy, 1)
-    inside = binary_erosion(padded, generate_binary_structure(3, 1))[1:-1, 1:-1, 1:-1]
+    faces = ndimage.generate_binary_structure(3, 1)
+    inside = ndimage.binary_erosion(padded, faces)[1:-1, 1:-1, 1:-1]
     assert not np.any(made.occupancy & ~inside & ~surface)
     # The object fills the cube on both sides.
     for voxels in (made.views[0].coords, np.argwhere(made.occupancy)):
@@ -76,8 +69,7 @@ def test_true_transform_lands_on_the_object(index):
     made = asset(index, 1)
     occupied = (np.argwhere(made.occupancy) + 0.5) / 64 - 0.5
     distance = cKDTree(occupied).query(looked_up(made.views[0]))[0] * 64
-    # A SLAT voxel's centre is within half a diagonal of the surface, and the
-    # surface within another half of the centre of a voxel that it meets.
+    # A SLAT voxel is within half a diagonal of the surface, which is as near to a grid's voxel.
     assert distance.max() <= 3**0.5
     assert np.quantile(distance, 0.98) <= 1.0
 
@@ -150,8 +142,8 @@ def test_half_painted_ball_is_symmetric_in_shape_but_not_in_material():
 @pytest.mark.parametrize("index", range(0, len(CATALOGUE), 3))
 def test_damage_bites_and_adds_floaters_one_without_a_label(index):
     made, whole = asset(index, 2), asset(index, 1)
-    pieces = label(made.occupancy, np.ones((3, 3, 3)))[1]
-    assert pieces > label(whole.occupancy, np.ones((3, 3, 3)))[1]
+    pieces = ndimage.label(made.occupancy, np.ones((3, 3, 3)))[1]
+    assert pieces > ndimage.label(whole.occupancy, np.ones((3, 3, 3)))[1]
     unlabelled = made.grid[..., 3] == -1
     assert 0 < unlabelled.sum() < 0.01 * made.occupancy.sum()
     assert not made.grid[unlabelled, :3].any()
@@ -243,10 +235,7 @@ def distortion(seed):
 def test_a_distortion_folds_nowhere_and_keeps_its_bound(seed):
     shape = distortion(seed)
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (3_000, 3))
-    step = 1e-5
-    columns = [
-        (shape(points + step * e) - shape(points - step * e)) / (2 * step) for e in np.eye(3)
-    ]
+    columns = [(shape(points + e) - shape(points - e)) / 2e-5 for e in 1e-5 * np.eye(3)]
     jacobian = np.stack(columns, axis=-1)
     assert np.linalg.det(jacobian).min() > 0.2
     assert np.linalg.norm(jacobian, 2, axis=(1, 2)).max() <= shape.stretch
@@ -281,7 +270,6 @@ def test_places_are_where_the_maps_inverted_by_numbers_put_them():
     frames = generate(rng, frames, LEVELS[5].bend, solid, skin)
     shape, slat = frames.distortion, frames.slat
     waves = shape.waves
-    wanted = skin[:20]
 
     def object_of(y):
         q = (y - shape.middle) / shape.size
@@ -292,14 +280,14 @@ def test_places_are_where_the_maps_inverted_by_numbers_put_them():
         )
         return shape.middle + shape.size * (q + growth * bend) / shape.proportions
 
-    for point in wanted:
+    def placed(pose, there):
+        return pose.scale * pose.rotation @ (there - pose.centre) + pose.shift
+
+    for point in skin[:20]:
         found = root(lambda y, p=point: object_of(y) - p, point, tol=1e-13)
         assert found.success
-        in_slat, in_pixieverse = (
-            pose.scale * pose.rotation @ (there - pose.centre) + pose.shift
-            for pose, there in ((slat, found.x), (frames.pixieverse, point))
-        )
-        assert np.allclose(frames.places(in_slat[None])[0], in_pixieverse, atol=1e-10)
+        there = frames.places(placed(slat, found.x)[None])[0]
+        assert np.allclose(there, placed(frames.pixieverse, point), atol=1e-10)
 
 
 @pytest.mark.parametrize("level", [5, 7])
@@ -354,17 +342,17 @@ def test_a_nerf_field_is_thick_and_rough_with_hollows_and_blobs():
     for seed in range(20):
         field = nerf_field(np.random.default_rng(seed), stuff, np.array([0.0, 0.0, 1.0]), 3)
         occupied = field != -1
-        pieces, count = label(occupied, np.ones((3, 3, 3)))
+        pieces, count = ndimage.label(occupied, np.ones((3, 3, 3)))
         body = pieces == pieces[16, 32, 38]
         unlabelled.append((field == UNLABELLED).sum())
         blobs.append(count - 1)
-        hollow.append((binary_fill_holes(occupied) & ~occupied).sum())
+        hollow.append((ndimage.binary_fill_holes(occupied) & ~occupied).sum())
         # Above the block's middle nothing of the ground is seen.
-        signed = np.where(body, 0.5 - distance_transform_edt(body), 0)
-        signed += np.where(body, 0, distance_transform_edt(~body) - 0.5)
+        signed = np.where(body, 0.5 - ndimage.distance_transform_edt(body), 0)
+        signed += np.where(body, 0, ndimage.distance_transform_edt(~body) - 0.5)
         u, v = np.meshgrid(np.arange(22.0, 42.0), np.arange(28.0, 38.0))
         face = np.stack([np.full(u.size, 15.5), u.ravel(), v.ravel()])
-        thick.append(-map_coordinates(signed, face, order=1))
+        thick.append(-ndimage.map_coordinates(signed, face, order=1))
         grounds += occupied[20:44, 20:44, 14].mean() > 0.9
     assert np.mean(thick) == pytest.approx(0.5, abs=0.2) and 0.3 < np.std(thick) < 1.0
     assert np.mean(np.array(hollow) > 0) > 0.9
@@ -428,16 +416,9 @@ def test_support_is_the_edge_of_what_is_inside(shape):
 
 def test_point_belongs_to_the_nearest_part_and_its_coat():
     stuffs = [Stuff(k, 10.0 ** (k + 4), 100.0 * (k + 1), 0.3) for k in range(3)]
-    solid = Solid(
-        [
-            Part(shapes.sphere((-0.3, 0, 0), 0.25), stuffs[0]),
-            Part(
-                shapes.sphere((0.3, 0, 0), 0.25),
-                stuffs[1],
-                ((shapes.half_space((0.3, 0, 0), (0, 0, 1)), stuffs[2]),),
-            ),
-        ]
-    )
+    coat = (shapes.half_space((0.3, 0, 0), (0, 0, 1)), stuffs[2])
+    left, right = (shapes.sphere((x, 0, 0), 0.25) for x in (-0.3, 0.3))
+    solid = Solid([Part(left, stuffs[0]), Part(right, stuffs[1], (coat,))])
     points = np.array([[-0.3, 0, 0.1], [0.3, 0, 0.1], [0.3, 0, -0.1], [0.52, 0.0, 0.01]])
     assert solid.stuff_at(points).tolist() == [0, 2, 1, 2]
     material, properties = solid.table()
@@ -456,8 +437,7 @@ def test_shortcut_near_each_part_equals_the_plain_minimum(category):
     points = rng.uniform(solid.extent[0] - 0.05, solid.extent[1] + 0.05, (5_000, 3))
     plain = np.min([part.shape.distance(points) for part in model.parts], axis=0)
     distance, _ = solid.evaluate(points)
-    # Farther than its reach the solid says no more than "at least so far",
-    # and so does a bound that is not the distance itself.
+    # Farther than its reach the solid says no more than "at least so far".
     close = plain < solid.reach
     assert np.all((distance <= 0) == (plain <= 0))
     assert np.all(distance[close] >= plain[close])

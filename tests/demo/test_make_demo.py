@@ -79,13 +79,10 @@ def test_layout_is_that_of_the_real_data(demo):
 
 
 def test_definition_names_the_roots(demo):
-    definition = tomllib.loads(demo.config.read_text())
-    assert definition == {
-        "name": "demo-7",
-        "pixieverse": {"root": "pixieverse"},
-        "slat": {"root": "slat"},
+    assert tomllib.loads(demo.config.read_text()) == {
+        "name": "demo-7", "pixieverse": {"root": "pixieverse"}, "slat": {"root": "slat"},
         "pairing": {"categories": "obj_ids_metadata.json"},
-    }
+    }  # fmt: skip
 
 
 def test_same_bytes_again_with_any_number_of_jobs_and_of_assets(demo, tmp_path):
@@ -94,9 +91,8 @@ def test_same_bytes_again_with_any_number_of_jobs_and_of_assets(demo, tmp_path):
     for _ in range(2):  # the second time over itself
         make_demo(tmp_path / "fewer", 2, 7)
         for folder in ("pixieverse", "slat", "truth"):
-            assert (
-                tree(tmp_path / "fewer" / folder).items() <= tree(demo.directory / folder).items()
-            )
+            fewer, all_of = (tree(one / folder) for one in (tmp_path / "fewer", demo.directory))
+            assert fewer.items() <= all_of.items()
 
 
 @pytest.mark.usefixtures("made_once")
@@ -135,10 +131,10 @@ def test_slat_forms_hold_the_same_voxels(tmp_path):
     with h5py.File(tmp_path / "hdf5" / "slat" / f"{uid}.h5") as file:
         assert np.array_equal(file["coords"], view.coords)
         assert np.array_equal(file["feats"], view.feats)
-    with h5py.File(tmp_path / "hdf5-groups" / "slat" / "latents.h5") as file:
+    root = tmp_path / "hdf5-groups"
+    with h5py.File(root / "slat" / "latents.h5") as file:
         assert len(file) == 2
         assert np.array_equal(file[uid]["coords"], view.coords)
-    root = tmp_path / "hdf5-groups"
     first = tree(root)
     assert tomllib.loads((root / "dataset.toml").read_text())["slat"]["root"] == "slat/latents.h5"
     make_demo(root, 2, 7, slat_form="hdf5-groups")

@@ -24,21 +24,12 @@ ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"  # latent_model of TREL
 
 
 class StructuredLatents:
-    """What TRELLIS's data set does with a root, by the documentation of its columns.
+    """What TRELLIS's data set does with a root, by the documentation of its columns."""
 
-    A row of ``metadata.csv`` is an asset. Those are taken that have latents of
-    the model, a score of at least the least one and at most as many voxels as
-    allowed; the file is found by ``sha256``, the load of a batch by
-    ``num_voxels``.
-    """
-
-    def __init__(
-        self, root: Path, model: str, least_score: float = 5.0, most_voxels: int = 32768
-    ) -> None:
+    def __init__(self, root: Path, model: str, score: float = 5.0, most: int = 32768) -> None:
         table = pandas.read_csv(root / "metadata.csv")
         table = table[table[f"latent_{model}"]]
-        table = table[table["aesthetic_score"] >= least_score]
-        table = table[table["num_voxels"] <= most_voxels]
+        table = table[(table["aesthetic_score"] >= score) & (table["num_voxels"] <= most)]
         self.names = list(table["sha256"])
         self.loads = [table.set_index("sha256").loc[name, "num_voxels"] for name in self.names]
         self.folder = root / "latents" / model
@@ -60,9 +51,8 @@ def test_an_npz_export_is_what_trellis_loads(model, store, mixed, tmp_path):
         np.testing.assert_array_equal(feats, mixed.assets[name].feats)
         assert loaded.loads[index] == len(coords)
     most = sorted(loaded.loads)[2]
-    assert len(StructuredLatents(tmp_path / "root", model or ENCODER, 9.0, most).names) == sum(
-        load <= most for load in loaded.loads
-    )
+    few = StructuredLatents(tmp_path / "root", model or ENCODER, 9.0, most).names
+    assert len(few) == sum(load <= most for load in loaded.loads)
 
 
 def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
@@ -113,10 +103,7 @@ def test_a_model_that_names_no_folder_is_refused(name, store, tmp_path):
 
 
 def load_materials(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions (N, 3) and E, nu, density (N, 3) with the steps of `load_material_data`.
-
-    That is VoMP's loader for its warp.fem script; those for Newton and libuipc take the same.
-    """
+    """Read positions (N, 3) and E, nu, density (N, 3) as VoMP's `load_material_data` does."""
     voxels = np.load(path)["voxel_data"]
     where = np.stack([voxels[axis] for axis in ("x", "y", "z")], axis=1)
     what = [voxels[name] for name in ("youngs_modulus", "poissons_ratio", "density")]
@@ -172,10 +159,8 @@ def test_points_may_be_chosen_for_voxel_data_and_the_frame_may_not(store, tmp_pa
 
 # As `map_pred_to_coords.py` of Pixie declares the rows of its files.
 PIXIE_VERTEX = [
-    ("x", "f4"), ("y", "f4"), ("z", "f4"),
-    ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1"),
-    ("part_label", "i4"), ("density", "f4"), ("E", "f4"), ("nu", "f4"),
-    ("material_id", "i4"),
+    *((axis, "f4") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue", "alpha")),
+    ("part_label", "i4"), ("density", "f4"), ("E", "f4"), ("nu", "f4"), ("material_id", "i4"),
     ("conf", "f4"),
 ]  # fmt: skip
 
@@ -211,7 +196,9 @@ def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path
     voxels = np.argwhere(grid[..., 3] != 7)
     for frame in ("slat", "pixieverse"):
         options = ExportOptions(points="grid", frame=frame)
-        export_store(store, tmp_path / frame, "ply", assets=["cup"], options=options)
+        done = export_store(store, tmp_path / frame, "ply", options=options)
+    assert "5 assets have no world bounds" in done.notes[0]
+    assert json.loads((tmp_path / frame / "index.json").read_text())["notes"] == list(done.notes)
     world, slat = (
         plyfile.PlyData.read(tmp_path / frame / "cup.ply")["vertex"]
         for frame in ("pixieverse", "slat")
@@ -242,12 +229,6 @@ def test_world_bounds_of_the_records_are_used(make_dataset: MakeDataset, tmp_pat
     voxels = np.argwhere(dataset.assets["cup"].grid[..., 3] != 7)
     expected = np.take_along_axis(np.linspace(lo, hi, 64), voxels, axis=0)
     np.testing.assert_allclose(positions_of(vertex), expected, atol=1e-5)
-
-
-def test_a_field_without_bounds_is_told(store, tmp_path):
-    done = export_store(store, tmp_path / "ply", "ply", options=ExportOptions(frame="pixieverse"))
-    assert "5 assets have no world bounds" in done.notes[0]
-    assert json.loads((tmp_path / "ply" / "index.json").read_text())["notes"] == list(done.notes)
 
 
 def test_bounds_that_make_no_sense_are_refused(copy, tmp_path):

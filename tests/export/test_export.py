@@ -7,7 +7,10 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -34,8 +37,6 @@ KINDS = ("hdf5", "npz")
 
 
 def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
-    import h5py
-
     out = tmp_path / "all.h5"
     export_store(store, out, "hdf5")
     with h5py.File(out) as file:
@@ -63,14 +64,19 @@ def test_an_export_is_itself_a_source_of_latents(format, name, store, mixed, tmp
     np.testing.assert_array_equal(read_latents(pairs["cup"]).feats, mixed.assets["cup"].feats)
 
 
-def test_shards_are_read_by_webdataset(store, mixed, tmp_path):
+def samples_of(folder: Path) -> list[dict[str, Any]]:
+    """Return what users of WebDataset get of its shards."""
     import webdataset
 
+    shards = sorted(map(str, folder.glob("*.tar")))
+    return list(webdataset.WebDataset(shards, shardshuffle=False).decode())
+
+
+def test_shards_are_read_by_webdataset(store, mixed, tmp_path):
     out = tmp_path / "shards"
     export_store(store, out, "webdataset", options=ExportOptions(shard_size=2))
-    shards = sorted(str(path) for path in out.glob("*.tar"))
-    assert len(shards) == 3
-    samples = list(webdataset.WebDataset(shards, shardshuffle=False).decode())
+    assert len(list(out.glob("*.tar"))) == 3
+    samples = samples_of(out)
     assert [sample["json"]["asset_id"] for sample in samples] == sorted(mixed.assets)
     for sample in samples:
         asset = mixed.assets[sample["json"]["asset_id"]]
@@ -110,9 +116,8 @@ def test_what_is_no_export_is_never_replaced(format, store, tmp_path):
     folder.mkdir()
     (folder / "thesis.txt").write_text("years of work")
     file.write_text("years of work")
-    for out in (folder, file):
-        wanted = "file" if format == "hdf5" else "folder"
-        there = "folder" if out.is_dir() else "file"
+    wanted = "file" if format == "hdf5" else "folder"
+    for out, there in ((folder, "folder"), (file, "file")):
         other = f"is a {there}, but this format writes a {wanted}"
         said = "is not an export" if there == wanted else other
         with pytest.raises(ConfigError, match=f"exists and {said}"):
@@ -209,24 +214,21 @@ def test_a_link_stays_and_a_failed_export_leaves_the_old_one(format, store, tmp_
 
 
 def test_assets_are_chosen_by_id_and_verdict(store, tmp_path):
-    export_store(store, tmp_path / "two", "npz", assets=["dog", "cup", "dog"], verdicts=["good"])
-    assert [entry["asset_id"] for entry in index_of(tmp_path / "two")] == ["cup", "dog"]
+    for arguments, chosen in (
+        ({"assets": ["dog", "cup", "dog"], "verdicts": ["good"]}, ["cup", "dog"]),
+        ({"assets": "bear.front"}, ["bear.front"]),  # A text is one asset, or one verdict.
+        ({"verdicts": "good"}, open_store(store).ids),
+    ):
+        export_store(store, tmp_path / "some", "npz", **arguments)
+        assert [entry["asset_id"] for entry in index_of(tmp_path / "some")] == chosen
     for arguments, said in (
         ({"assets": ["cuo"]}, r"did you mean cup\?"),
+        ({"assets": "23"}, "no asset 23;"),
         ({"verdicts": ["failed"]}, r"no asset has the verdict failed; .* are 5 good"),
         ({"verdicts": ["fine"]}, r"'fine'; expected one of good, doubtful, failed"),
     ):
         with pytest.raises(ConfigError, match=said):
             export_store(store, tmp_path / "none", "npz", **arguments)
-
-
-def test_a_text_is_one_asset_and_one_verdict(store, tmp_path):
-    one = open_store(store).ids[1]
-    assert export_store(store, tmp_path / "one", "ply", assets=one).assets == 1
-    with pytest.raises(ConfigError, match="no asset 23;"):
-        export_store(store, tmp_path / "none", "ply", assets="23")
-    listed = export_store(store, tmp_path / "list", "ply", verdicts=["good"])
-    assert export_store(store, tmp_path / "good", "ply", verdicts="good").assets == listed.assets
 
 
 def test_splits_go_out_apart_and_together_they_are_all(store, tmp_path):
@@ -279,8 +281,6 @@ def test_hostile_ids_stay_inside_every_export(format, copy, tmp_path):
     assert there == {"deep", copy.name, f"{copy.stem}.manifests"}
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["export"]
     if format == "hdf5":
-        import h5py
-
         with h5py.File(out) as file:
             assert {group.attrs["asset_id"] for group in file.values()} == set(names)
     else:
@@ -288,11 +288,7 @@ def test_hostile_ids_stay_inside_every_export(format, copy, tmp_path):
     if format == "webdataset":
         with tarfile.open(next(out.glob("*.tar"))) as tar:
             assert all("/" not in name for name in tar.getnames())
-        import webdataset
-
-        shards = [str(path) for path in out.glob("*.tar")]
-        samples = webdataset.WebDataset(shards, shardshuffle=False).decode()
-        assert {sample["json"]["asset_id"] for sample in samples} == set(names)
+        assert {sample["json"]["asset_id"] for sample in samples_of(out)} == set(names)
 
 
 # -- killed exports --------------------------------------------------------

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,41 +101,34 @@ def test_only_assets_that_went_into_shards_are_counted(copy, tmp_path):
     assert rows and all(row[5] == "0" for row in rows), table
 
 
-def test_a_card_says_what_is_not_known(mixed_build):
+def test_a_card_says_what_is_known_and_what_is_not(mixed_build):
     store = open_store(mixed_build.store)
-    assert "Not stated: ask" in card_of(store, Stated(), "s.zarr", [])
+    card = card_of(store, Stated(), "s.zarr", [])
+    assert "| density | kg/m³ | log10 |" in card and "| youngs_modulus | Pa | log10 |" in card
+    assert "Not stated: ask" in card
     linked = card_of(store, Stated(license="https://a.org/l", cite_as="```me"), "s.zarr", [])
     assert 'license: "other"' in linked and 'license_link: "https://a.org/l"' in linked
     assert "```\n'''me\n```" in linked
 
 
-def test_no_control_character_of_a_category_reaches_a_text(copy):
+def test_no_category_is_a_control_character_or_the_row_of_all(copy):
     word = "cup\x1b[2J\x9b\u202e\n"
-    rewrite(copy, "asset/category", 0, word)
+    rewrite(copy, "asset/category", slice(0, 2), np.array([word, "all"], object))
     store = open_store(copy)
     card = card_of(store, Stated(name="a\x85b", cite_as="me\x1b"), "s.zarr", [])
     text = to_json(describe(store))
     for made in (card, text):
         assert all(c.isprintable() or c == "\n" for c in made)
-    assert "cup\\u001b" in card
+    assert "cup\\u001b" in card and '\n| "all" | 1 | ' in card and "\n| all | 5 | " in card
     assert json.loads(text)["recordSet"][-1]["data"][0]["assets/category"] == word
 
 
-def test_a_category_called_all_is_told_from_the_row_of_all(copy):
-    rewrite(copy, "asset/category", 0, "all")
-    card = card_of(open_store(copy), Stated(), "s.zarr", [])
-    assert '\n| "all" | 1 | ' in card and "\n| all | 5 | " in card
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--date-published", "2026-99-99"), "'2026-99-99'; expected a day such as 2026-01-31"),
-        (("--date-published", "20260131"), "expected a day such as 2026-01-31"),
-        (("--url", "my page"), "url is 'my page'; expected"),
-        (("--url", "ftp:"), "expected a page such as https://example.org/data"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (("--date-published", "2026-99-99"), "'2026-99-99'; expected a day such as 2026-01-31"),
+    (("--date-published", "20260131"), "expected a day such as 2026-01-31"),
+    (("--url", "my page"), "url is 'my page'; expected"),
+    (("--url", "ftp:"), "expected a page such as https://example.org/data"),
+])  # fmt: skip
 def test_what_is_stated_is_what_it_says(words, said, store, tmp_path):
     assert said in run(store, "--out", tmp_path / "hub", *words, code=2).stderr
     assert said in commands.refused("describe", store, *words)
@@ -203,23 +195,6 @@ def test_shards_are_a_dataset_of_the_hubs_library(root, mixed_build, tmp_path, m
         np.testing.assert_array_equal(row["npz"]["properties"], asset.properties)
 
 
-def test_a_card_has_the_properties_that_the_store_holds(mixed_build):
-    store = open_store(mixed_build.store)
-    card = card_of(store, Stated(), "s.zarr", [])
-    assert "| density | kg/m³ | log10 |" in card and "| youngs_modulus | Pa | log10 |" in card
-    held = store.about.contents.properties
-    ranges = store.about.normalization
-    two = replace(
-        store.about,
-        property_columns=tuple(one.name for one in held[1:]),
-        property_units=("g/cm^3", "1"),
-        normalization={one.name: ranges[one.name] for one in held[1:]},
-    )
-    store.__dict__["about"] = two
-    card = card_of(store, Stated(), "s.zarr", [])
-    assert "| density | g/cm³ | log10 |" in card and "youngs_modulus" not in card
-
-
 STATED = {
     "license": "https://creativecommons.org/licenses/by/4.0/",
     "url": "https://example.org/dataset",
@@ -249,9 +224,8 @@ def test_croissant_s_records_are_the_store_s(store, tmp_path):
     group = zarr.open_group(store, mode="r")
     assets = list(dataset.records("assets"))
     assert [row["assets/id"] for row in assets] == list(group["asset/id"][:])
-    np.testing.assert_array_equal(
-        [row["assets/fitness"] for row in assets], group["asset/fitness"][:]
-    )
+    fitness = [row["assets/fitness"] for row in assets]
+    np.testing.assert_array_equal(fitness, group["asset/fitness"][:])
     offsets = group["asset/offset"][:]
     assert [row["assets/first_row"] for row in assets] == offsets[:-1].tolist()
     assert [row["assets/end_row"] for row in assets] == offsets[1:].tolist()
@@ -263,7 +237,7 @@ def test_croissant_s_records_are_the_store_s(store, tmp_path):
 
 
 def test_croissant_says_what_a_store_of_other_contents_holds(tmp_path):
-    density, hue = Property("density", "kg/m^3", True), Property("hue", "1", False)
+    density, hue = Property("density", "g/cm^3", True), Property("hue", "1", False)
     for table, classes, said in (
         ((density, hue), ("oak", "elm"), "its density, hue and material class, normalised"),
         ((density,), (), "its density, normalised"),
@@ -271,8 +245,9 @@ def test_croissant_says_what_a_store_of_other_contents_holds(tmp_path):
         store = tmp_path / f"{len(table)}.zarr"
         make_store(store, Contents(table, classes))
         opened = open_store(store)
-        text = to_json(describe(opened))
-        assert said in text and said in card_of(opened, Stated(), "s.zarr", [])
+        text, card = to_json(describe(opened)), card_of(opened, Stated(), "s.zarr", [])
+        assert said in text and said in card
+        assert "| density | g/cm³ | log10 |" in card and "youngs_modulus" not in card
         assert not any(word in text for word in ("PixieVerse material", "Young", "PhysGaussian"))
 
 
@@ -300,6 +275,8 @@ def test_describe_writes_where_the_files_are_found(store, tmp_path):
             assert any(path.name == "zarr.json" for path in files)
             # Of an array of one value alone, its fill value, Zarr writes no chunk.
             assert len(files) >= (2 if entry["@id"].startswith("voxel/") else 1)
-    printed = commands.run("describe", store, "--location", "https://example.org/s.zarr/")
+    words = ("--location", "https://example.org/s.zarr/", "--license", STATED["license"])
+    printed = commands.run("describe", store, *words)
+    assert "also ask for --cite-as, --url, --date-published" in printed.stderr
     (root, *_) = json.loads(printed.stdout)["distribution"]
     assert root["contentUrl"] == "https://example.org/s.zarr/zarr.json"

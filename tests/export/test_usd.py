@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.commands import refused, run
 from support.exports import index_of
-from support.synthetic import JELLY, METAL, QUARTER_TURN, Dataset
+from support.synthetic import JELLY, QUARTER_TURN, Dataset
 
 from slatprep.errors import ConfigError
 from slatprep.export import ExportOptions, export_store
@@ -95,9 +95,8 @@ def test_openusd_reads_back_places_masses_and_materials(exported, mixed):
         expected = np.array([YIELDING[int(number)].stress for number in truth[:, 3]])
         np.testing.assert_allclose(read["newton:mpm:yieldStress"], expected, rtol=1e-6)
         # It stands on the ground, also where another file refers to it.
-        box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"]).ComputeWorldBound(
-            stage.GetPrimAtPath("/Asset")
-        )
+        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"])
+        box = cache.ComputeWorldBound(stage.GetPrimAtPath("/Asset"))
         assert abs(box.ComputeAlignedRange().GetMin()[2]) < 1e-6
 
 
@@ -123,10 +122,8 @@ def test_the_scene_has_every_asset_apart_from_the_others(exported):
     for number, box in enumerate(boxes):
         assert abs(box.GetMin()[2]) < 1e-6
         for other in boxes[:number]:
-            apart = np.maximum(
-                np.array(box.GetMin()) - other.GetMax(), np.array(other.GetMin()) - box.GetMax()
-            )
-            assert apart.max() > 0
+            gaps = (np.subtract(a.GetMin(), b.GetMax()) for a, b in ((box, other), (other, box)))
+            assert np.max(list(gaps)) > 0
     # The physics scenes of the assets' files stay there: a scene has one.
     assert sum(prim.GetTypeName() == "PhysicsScene" for prim in stage.Traverse()) == 1
     assert json.loads((exported / "index.json").read_text())["files"] == ["scene.usda"]
@@ -208,11 +205,6 @@ def test_newton_s_importer_gives_back_stiffness_ratio_and_mass(exported, mixed):
         np.testing.assert_allclose(ratio, truth[:, 2], atol=1e-5)
         mass = truth[:, 0] * (SIZE / 64) ** 3
         np.testing.assert_allclose(model.particle_mass.numpy()[here], mass, rtol=2e-3)
-        stuff = {JELLY[1]: JELLY[0], METAL[1]: METAL[0]}
-        assert {stuff[min(stuff, key=lambda k: abs(k / e - 1))] for e in np.unique(modulus)} == {
-            0,
-            1,
-        }
 
 
 @NEWTON

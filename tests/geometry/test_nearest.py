@@ -130,10 +130,9 @@ def test_each_vote_is_of_its_own_labels():
     voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
     point = voxel_centres([[30.4, 20, 20]])
     lattice = Lattice(voxels)
-    alike, mixed = np.zeros(4, np.uint8), np.array([2, 5, 5, 5], dtype=np.uint8)
-    assert [
-        lattice.voted(point, labels, 1.0, 2.0)[1].tolist() for labels in (alike, mixed, alike)
-    ] == [[0], [1], [0]]
+    for labels, winner in (([0] * 4, 0), ([2, 5, 5, 5], 1), ([0] * 4, 0)):
+        voted = lattice.voted(point, np.array(labels, np.uint8), 1.0, 2.0)[1]
+        assert voted.tolist() == [winner]
 
 
 def test_of_a_drawn_vote_the_lower_label_wins():

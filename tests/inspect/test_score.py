@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.commands import document, run
+from support.commands import document, refused, run
 from support.made_store import rewrite
 from support.shapes import GRID, annotated, field_of, latents_of
 
@@ -19,26 +19,20 @@ from slatprep.inspect.score import (
     score_against_truth,
     summarise,
 )
-from slatprep.records import MaterialField
 from slatprep.store import open_store
 
 # A rod of two materials along x in the PixieVerse frame.
 ROD = np.array([[x, 32, 32] for x in range(20, 40)])
 ROD_MATERIAL = np.where(ROD[:, 0] < 30, 1, 5).astype(np.uint8)
-TRUTH = Truth(Path("a.npz"), np.eye(4), ROD_MATERIAL, "rod", 1, False)
+UNMOVED = np.eye(4)
+TRUTH = Truth(Path("a.npz"), UNMOVED, ROD_MATERIAL, "rod", 1, False)
 FIELD = field_of(occupancy_of(ROD), np.where(GRID[..., 0] < 30, 1, 5))
 
 
-def scored(
-    truth: Truth = TRUTH,
-    coords: np.ndarray = ROD,
-    transform: np.ndarray | None = None,
-    field: MaterialField = FIELD,
-    **of_annotation: np.ndarray,
-) -> TruthScore:
+def scored(truth=TRUTH, coords=ROD, transform=UNMOVED, field=FIELD, **of_annotation) -> TruthScore:
     """Score a rod whose voxels are the SLAT's and labelled right, but for what is said of it."""
     latents = latents_of(coords)
-    places = places_of(latents.centres, np.eye(4) if transform is None else transform)
+    places = places_of(latents.centres, transform)
     annotation = replace(annotated(truth.material, places), **of_annotation)
     return compare_with_truth("a", truth, field, latents, annotation)
 
@@ -82,15 +76,13 @@ def test_unannotated_voxels_are_no_answer():
 
 
 def test_level_figures_leave_symmetric_assets_out():
-    (level,) = summarise(
-        [
-            TruthScore("a", "", 5, False, 3.4, 1.0, 1.0, 1.0, 2.0, 0.95),
-            TruthScore("b", "", 5, False, 3.5, 0.8, 0.9, 0.5, 2.0, 0.85),
-            TruthScore("c", "", 5, False, 0.2, 0.6, 0.8, 0.6, 4.0, 0.81),
-            TruthScore("d", "", 5, True, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-            TruthScore("e", "", 3, True, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        ]
-    )
+    (level,) = summarise([
+        TruthScore("a", "", 5, False, 3.4, 1.0, 1.0, 1.0, 2.0, 0.95),
+        TruthScore("b", "", 5, False, 3.5, 0.8, 0.9, 0.5, 2.0, 0.85),
+        TruthScore("c", "", 5, False, 0.2, 0.6, 0.8, 0.6, 4.0, 0.81),
+        TruthScore("d", "", 5, True, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        TruthScore("e", "", 3, True, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    ])  # fmt: skip
     # Right is less than 1.5 above the best similarity: 3.4 and 0.2, and not 3.5.
     expected = {
         "level": 5, "assets": 3, "success": 2 / 3, "displacement_median": 3.4,
@@ -106,21 +98,16 @@ def test_displacement_is_from_the_true_places():
     places = np.column_stack([(long[:, 0] + 0.5) / 2 + 15, np.full((40, 2), 32.5)]) / 64 - 0.5
     material = np.where(places[:, 0] * 64 + 32 < 30, 1, 5).astype(np.uint8)
     truth = replace(TRUTH, material=material, places=places)
-    score = scored(truth, long)
-    # The identity leaves voxel x at x + 0.5 where x / 2 + 15.25 is right.
-    apart = np.abs(long[:, 0] + 0.5 - (long[:, 0] + 0.5) / 2 - 15)
-    assert score.displacement == pytest.approx(apart.mean())
-    assert score.similarity_displacement == pytest.approx(apart.mean())
-    assert score.label_accuracy == score.truth_own == 1.0
-    # The identity asks the rod of 20 voxels from 20 to 39, which changes at 30 as well.
-    assert score.similarity_accuracy == pytest.approx(1.0)
-    score = scored(replace(truth, transform=make_transform(np.eye(3), (5 / 64, 0, 0))), long)
-    # Back by five voxels, voxels 30 to 34 ask for the other material.
-    assert score.similarity_accuracy == pytest.approx(35 / 40)
-    assert score.truth_own == 1.0
-    assert score.displacement == pytest.approx(apart.mean())
-    moved = np.abs(long[:, 0] + 0.5 - 5 - (long[:, 0] + 0.5) / 2 - 15)
-    assert score.similarity_displacement == pytest.approx(moved.mean())
+    # The identity leaves voxel x at x + 0.5 where x / 2 + 15.25 is right, and asks the rod of 20
+    # voxels from 20 to 39, which changes at 30 as well; back by five, 30 to 34 ask for the other.
+    apart = (long[:, 0] + 0.5) / 2 - 15
+    for back, accuracy in ((0, 1.0), (5, 35 / 40)):
+        there = make_transform(np.eye(3), (back / 64, 0, 0))
+        score = scored(replace(truth, transform=there), long)
+        assert score.displacement == pytest.approx(np.abs(apart).mean())
+        assert score.similarity_displacement == pytest.approx(np.abs(apart - back).mean())
+        assert score.label_accuracy == score.truth_own == 1.0
+        assert score.similarity_accuracy == pytest.approx(accuracy)
     aside = scored(truth, long, place=np.add(places, [0.0, 1 / 64, 0.0]))
     assert aside.displacement == pytest.approx(1.0)
 
@@ -169,21 +156,28 @@ def test_a_printed_score_fits_a_terminal_and_tells_of_a_truth_without_a_row(stor
     assert found["missing"] == ["nobody"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"material": np.zeros(19, np.uint8)}, r"material has shape \(19,\)"),
-        ({"places": np.zeros((19, 3))}, r"places has shape \(19, 3\)"),
-        ({"material": None}, ".*material"),
-        (b"PK\x03\x04 cut off", "cannot be read"),
-    ],
-)
-def test_truth_that_does_not_fit_is_named(store, tmp_path, changes, told):
+@pytest.mark.parametrize(("changes", "told"), [
+    ({"material": np.zeros(19, np.uint8)}, r": material has shape \(19,\)"),
+    ({"places": np.zeros((19, 3))}, r": places has shape \(19, 3\)"),
+    ({"material": None}, ".*material"),
+    ({"material": lambda count: np.full(count, "x")}, r": cannot be read \(has dtype"),
+    ({"transform": np.zeros((4, 4))}, ".*transform"),
+    ({"transform": np.full((4, 4), np.nan)}, ".*transform"),
+    ({"transform": np.eye(3)}, r": cannot be read \(has shape \(3, 3\)"),
+    ({"name": np.array([{}], object)}, ": cannot be read"),
+    ({"level": np.arange(3)}, r": cannot be read \(has shape \(3,\)"),
+    ({"places": lambda count: np.full((count, 3), np.nan)}, ".*places"),
+    (b"PK\x03\x04 cut off", ": cannot be read"),
+])  # fmt: skip
+def test_truth_that_is_none_or_does_not_fit_is_named(store, tmp_path, changes, told):
     with pytest.raises(InputError, match="no truth"):
         score_against_truth(store, tmp_path)
     if isinstance(changes, bytes):
         (tmp_path / "ant.npz").write_bytes(changes)
     else:
-        write_truth(store, tmp_path, "ant", **changes)
-    with pytest.raises(InputError, match=rf"ant\.npz: {told}"):
+        count = len(open_store(store).asset("ant").coords)
+        arrays = {name: v(count) if callable(v) else v for name, v in changes.items()}
+        write_truth(store, tmp_path, "ant", **arrays)
+    assert "ant.npz" in refused("score", store, tmp_path, code=1)
+    with pytest.raises(InputError, match=rf"ant\.npz{told}"):
         score_against_truth(store, tmp_path)

@@ -7,25 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.special import logit
+from support.demos import Case, made_cases
 from support.shapes import GRID, chair, field_of, surface_latents
 
 from slatprep.align import align
 from slatprep.align.figures import measure_figures
-from slatprep.demo import make_demo
-from slatprep.inspect.score import Truth, read_truth
 from slatprep.inspect.verify.assets import roundings
-from slatprep.judge import THRESHOLDS, voxel_confidence
+from slatprep.judge import THRESHOLDS, evidence, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import causes_of_doubt
 from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
-from slatprep.judge.evidence import (
-    FIGURES,
-    VOXEL_FIGURES,
-    _labels_of,
-    evidence_of,
-    labels_hold,
-    surroundings_of,
-)
 from slatprep.judge.verdict import LEAST_TARGETS
 from slatprep.normalize import (
     PIXIE_RANGES,
@@ -33,15 +24,8 @@ from slatprep.normalize import (
     from_mapped,
     normalize_properties,
 )
-from slatprep.parameters import (
-    AlignParameters,
-    BuildParameters,
-    PixieverseSource,
-    SampleParameters,
-    SlatSource,
-)
+from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.pipeline.annotate import look_up
-from slatprep.readers import discover, read_field, read_latents
 from slatprep.records import (
     Alignment,
     Annotation,
@@ -52,7 +36,6 @@ from slatprep.records import (
 )
 from slatprep.sample import sample
 
-Case = tuple[MaterialField, StructuredLatents, Truth]
 OF_PLACEMENT = ("margin", "clear_by", "ties", "alike")
 
 
@@ -67,16 +50,16 @@ def _ends(name: str) -> tuple[float, float]:
     return usual, (low if usual - low > high - usual else high)
 
 
-USUAL, WORST = np.array([_ends(name) for name in FIGURES]).T
+USUAL, WORST = np.array([_ends(name) for name in evidence.FIGURES]).T
 
 
 def made(count: int, towards: tuple[float, float], seed: int) -> np.ndarray:
     """Make figures of alignments that lie by so much between usual and worst."""
     rng = np.random.default_rng(seed)
-    part = rng.uniform(*towards, (count, 1)) + rng.normal(0, 0.05, (count, len(FIGURES)))
+    part = rng.uniform(*towards, (count, 1)) + rng.normal(0, 0.05, (count, len(evidence.FIGURES)))
     figures = USUAL + part * (WORST - USUAL)
     for name in OF_PLACEMENT:
-        figures[:, FIGURES.index(name)] = USUAL[FIGURES.index(name)]
+        figures[:, evidence.FIGURES.index(name)] = USUAL[evidence.FIGURES.index(name)]
     return figures
 
 
@@ -198,15 +181,7 @@ def _judged(
 
 @pytest.fixture(scope="module")
 def cases(tmp_path_factory: pytest.TempPathFactory) -> list[Case]:
-    root = tmp_path_factory.mktemp("fresh")
-    make_demo(root, 8, 4_711, levels=(1, 5, 6, 7))
-    parameters = BuildParameters(
-        pixieverse=PixieverseSource(root=root / "pixieverse"), slat=SlatSource(root=root / "slat")
-    )
-    return [
-        (read_field(pair), read_latents(pair), read_truth(root / "truth" / f"{pair.asset_id}.npz"))
-        for pair in discover(parameters)
-    ]
+    return made_cases(tmp_path_factory.mktemp("fresh"), 8, 4_711, 1, 5, 6, 7)
 
 
 @pytest.fixture(scope="module")
@@ -282,8 +257,8 @@ def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(of_a
         labels = []
         for one in (exact, at):
             own = sample(one, annotation.place, SampleParameters())
-            labels.append(np.concatenate(_labels_of(one, own)))
-        holds = labels_hold(at, own, roundings(PIXIE_RANGES))
+            labels.append(np.concatenate(evidence._labels_of(one, own)))
+        holds = evidence.labels_hold(at, own, roundings(PIXIE_RANGES))
         held.append(holds)
         same = np.array_equal(*labels)
         changed += not same
@@ -311,11 +286,11 @@ def test_own_objects_pass_and_other_objects_fail(cases, judged):
 )
 def test_a_better_figure_never_lowers_confidence(asked, name):
     model = MODELS[asked]
-    assert model.names == FIGURES
+    assert model.names == evidence.FIGURES
     own = [figure for figure in model.figures if figure.name == name]
     assert all(first.high == then.low for first, then in pairwise(own))
     values = np.repeat(USUAL[None], 40, axis=0)
-    values[:, FIGURES.index(name)] = np.linspace(own[0].low - 0.1, own[-1].high + 0.1, 40)
+    values[:, evidence.FIGURES.index(name)] = np.linspace(own[0].low - 0.1, own[-1].high + 0.1, 40)
     confidences = model.probability(values)
     if name not in SPEAK_FOR:
         confidences = confidences[::-1]
@@ -330,7 +305,7 @@ def test_each_question_has_figures_of_its_own():
 
 
 def test_the_voxels_curve_rises():
-    assert VOXEL.names == VOXEL_FIGURES
+    assert VOXEL.names == evidence.VOXEL_FIGURES
     odds, shares = np.array(VOXEL.curve).T
     assert (np.diff(odds) > 0).all() and (np.diff(shares) >= 0).all()
     assert shares[0] >= 0 and shares[-1] <= 1
@@ -339,7 +314,7 @@ def test_the_voxels_curve_rises():
 def test_a_figure_that_is_not_known_adds_nothing():
     values = USUAL.copy()
     known = PLACEMENT.probability(values)
-    values[FIGURES.index("margin")] = math.nan
+    values[evidence.FIGURES.index("margin")] = math.nan
     assert PLACEMENT.probability(values) == known
 
 
@@ -353,10 +328,10 @@ def of_a_chair() -> OfAChair:
 
 def test_any_engine_is_judged_by_the_same_figures(of_a_chair):
     field, latents, alignment, annotation = of_a_chair
-    around = surroundings_of(field, latents, alignment, annotation)
-    own = evidence_of(field, latents, alignment, annotation, around, 0.0)
+    around = evidence.surroundings_of(field, latents, alignment, annotation)
+    own = evidence.evidence_of(field, latents, alignment, annotation, around, 0.0)
     bare = replace(alignment, figures=None)
-    measured = evidence_of(field, latents, bare, annotation, around, 0.0)
+    measured = evidence.evidence_of(field, latents, bare, annotation, around, 0.0)
     np.testing.assert_allclose(measured, own, atol=0.05)
     assert measure_figures(field, latents, bare).score_slat > 0.9
 
@@ -382,11 +357,11 @@ def test_a_turned_placement_is_no_longer_sure(of_a_chair):
 def test_what_takes_confidence_away_is_summed_by_cause_largest_first():
     assert all(taken == 0 for taken in causes_of_doubt(USUAL).values())
     bent = USUAL.copy()
-    bent[FIGURES.index("bending")] = 1.0
+    bent[evidence.FIGURES.index("bending")] = 1.0
     assert next(iter(causes_of_doubt(bent))) == "shape"
     rng = np.random.default_rng(1)
     for _ in range(20):
-        figures = USUAL * rng.uniform(0.3, 1.7, len(FIGURES))
+        figures = USUAL * rng.uniform(0.3, 1.7, len(evidence.FIGURES))
         taken = causes_of_doubt(figures)
         # Every figure belongs to one cause, and what adds confidence makes up for nothing.
         added = SAME_OBJECT.contributions(figures)

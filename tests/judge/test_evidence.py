@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.shapes import GRID, aligned, annotated, field_of, latents_of, surface_latents
 
+from slatprep import records
 from slatprep.align.figures import measure_figures
 from slatprep.geometry.frames import make_transform
 from slatprep.judge.confidence import class_confidence, voxel_figures
@@ -20,60 +21,42 @@ from slatprep.judge.evidence import (
     labels_hold,
     surroundings_of,
 )
-from slatprep.records import (
-    Agreement,
-    Alignment,
-    Annotation,
-    Consensus,
-    Deformation,
-    FitFigures,
-    Ground,
-    MaterialField,
-    Property,
-    Quality,
-    StructuredLatents,
-)
 
 UPSIDE_DOWN = np.diag([-1.0, 1.0, -1.0, 1.0])
 FAR_OFF = make_transform(np.eye(3), [0.5, 0.5, 0.5])
 
-FIT = FitFigures(
+FIT = records.FitFigures(
     score_slat=0.81, score_pixieverse=0.72, score_similarity=0.63,
     evidence_affine=math.nan, evidence_deformable=math.nan,
     within=(0.4, 0.5, 0.6), offset=-0.3, roughness=0.7,
     moved=1.5, moved_most=4.0, stretch=(0.7, 1.2), bending=0.01, clear_by=1.9,
-    agreement=Agreement(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6)),
+    agreement=records.Agreement(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6)),
 )  # fmt: skip
 
 
-def fitted(transform: np.ndarray | None = None, *ties: np.ndarray) -> Alignment:
-    quality = Quality(0.9, 0.5, 0.8, 0.5, 0.7, 1.0)
+def fitted(transform: np.ndarray | None = None, *ties: np.ndarray) -> records.Alignment:
+    quality = records.Quality(0.9, 0.5, 0.8, 0.5, 0.7, 1.0)
     first = np.eye(4) if transform is None else transform
     return aligned(first, *ties, quality=quality, margin=0.2, figures=FIT)
 
 
-def column(painted: int) -> tuple[MaterialField, StructuredLatents, Annotation]:
-    """Return a column of 20 voxels, the lower ones painted, in the middle of the grid.
-
-    It stands in cells 31 and 32 along the first axis, so that `UPSIDE_DOWN` keeps its shape.
-    """
+def column(
+    painted: int,
+) -> tuple[records.MaterialField, records.StructuredLatents, records.Annotation]:
+    """Return a column of 20 layers, the lower ones painted, in the middle of the grid."""
     solid = np.zeros((64, 64, 64), dtype=bool)
-    solid[31:33, 32, 22:42] = True
+    solid[31:33, 32, 22:42] = True  # so that `UPSIDE_DOWN` keeps its shape
     field = field_of(solid, np.where(GRID[..., 2] < 22 + painted, 3, 1))
     latents = latents_of(field.voxels)
     return field, latents, annotated(field.material, latents.centres)
 
 
-AROUND = Surroundings(
-    others=np.zeros((4, 4), np.float32),
-    solid=np.array([[9, 0.2, 9, 9], [9, 0.4, 9, 9], [9, 0.6, 9, 9], [9, 0.8, 9, 9]], np.float32),
-    distance=np.zeros(4, np.float32),
-    moved=np.zeros(4, np.float32),
-    tied=np.zeros(4, np.float32),
-)
+NOTHING = np.zeros(4, np.float32)
+SOLID = np.array([[9, share, 9, 9] for share in (0.2, 0.4, 0.6, 0.8)], np.float32)
+AROUND = Surroundings(np.zeros((4, 4), np.float32), SOLID, NOTHING, NOTHING, NOTHING)
 
 
-def figures(alignment: Alignment, ambiguity: float) -> dict[str, float]:
+def figures(alignment: records.Alignment, ambiguity: float) -> dict[str, float]:
     field, latents, _ = column(5)
     material = np.array([1, 1, 1, 255])
     annotation = annotated(material, distance=np.array([0.0, 1.0, 2.0, 9.0], np.float32))
@@ -113,7 +96,7 @@ def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose():
     several = figures(tied, HARMLESS + 0.001)
     assert (several["margin"], several["alike"]) == (0.2, 0.0)
     assert several["ties"] == pytest.approx(math.log(2))
-    settled = replace(tied, settled_by=Consensus(np.eye(3), 5, 5))
+    settled = replace(tied, settled_by=records.Consensus(np.eye(3), 5, 5))
     for alignment, ambiguity in ((tied, HARMLESS), (tied, 0.0), (settled, 1.0)):
         one = figures(alignment, ambiguity)
         assert math.isnan(one["margin"]) and math.isnan(one["clear_by"])
@@ -121,7 +104,7 @@ def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose():
     # Without ties the margin says how far behind the next placement is, up to a limit.
     assert figures(fitted(), 0.0)["margin"] == 0.2
     assert figures(replace(fitted(), margin=0.5), 0.0)["margin"] == 0.3
-    on_ground = replace(fitted(), ground=Ground(np.array([0.0, 0.0, 1.0]), -0.2))
+    on_ground = replace(fitted(), ground=records.Ground(np.array([0.0, 0.0, 1.0]), -0.2))
     assert figures(on_ground, 0.0)["ground"] == 1.0
 
 
@@ -133,8 +116,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
     latents = latents_of(voxels)
     annotation = annotated(np.array([1, 1, 1, 255]), latents.centres)
     around = surroundings_of(field, latents, fitted(), annotation)
-    # Of 14 cells one and four lie above: 1, 2, 4 and 7 voxels along the axis, and 1, 1, 2 and 4
-    # along the diagonals of space.
+    # Of 14 cells one and four lie above: 1, 2, 4, 7 voxels along the axis, 1, 1, 2, 4 diagonally.
     above = np.array([[5, 5, 5, 5], [0, 0, 1, 5], [0, 0, 0, 0]]) / 14
     np.testing.assert_allclose(around.others[:3], above, rtol=1e-6)
     np.testing.assert_allclose(around.others[3], 1.0)  # without a class all are others
@@ -146,7 +128,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
 
 def test_how_far_a_deformation_moves_is_measured_in_the_frame_of_the_annotation():
     field, latents, annotation = column(5)
-    pushed = Deformation(np.eye(3, 4), np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)))
+    pushed = records.Deformation(np.eye(3, 4), np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)))
     alignment = replace(fitted(make_transform(np.eye(3), scale=0.5)), deformation=pushed)
     steps = np.linspace(0.0, 3.0, len(latents.coords))
     place = 2.0 * latents.centres + steps[:, None] * np.array([0.6, 0.0, 0.8]) / 64
@@ -171,7 +153,7 @@ def test_ties_count_by_how_many_of_them_change_the_class(most, ties, share, monk
     changes = np.isin(latents.coords[:, 2], [*range(22, 27), *range(37, 42)])
     tied = surroundings_of(field, latents, fitted(None, *ties), annotation).tied
     np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
-    settled = replace(fitted(None, *ties), settled_by=Consensus(np.eye(3), 5, 5))
+    settled = replace(fitted(None, *ties), settled_by=records.Consensus(np.eye(3), 5, 5))
     assert not surroundings_of(field, latents, settled, annotation).tied.any()
 
 
@@ -185,28 +167,25 @@ def test_ties_that_change_few_classes_count_as_one():
     assert not surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied.any()
 
 
-def plain_field(values: np.ndarray) -> MaterialField:
+def plain_field(values: np.ndarray) -> records.MaterialField:
     """Return a field without classes, of voxels (K, P) of properties that are not mapped."""
     voxels = np.argwhere(np.ones((64, 64, 64), dtype=bool))[: len(values)].astype(np.uint8)
     solid = np.zeros((64, 64, 64), dtype=bool)
     solid[tuple(voxels.T)] = True
-    table = tuple(Property(f"p{k}", "1", False) for k in range(values.shape[1]))
+    table = tuple(records.Property(f"p{k}", "1", False) for k in range(values.shape[1]))
     nothing = np.zeros(len(values), np.uint8)
-    return MaterialField(
-        solid, voxels, nothing, values.astype(np.float32), table=table, classified=False
-    )
+    values = values.astype(np.float32)
+    return records.MaterialField(solid, voxels, nothing, values, table=table, classified=False)
 
 
-def as_annotation(field: MaterialField, rows: np.ndarray) -> Annotation:
+def as_annotation(field: records.MaterialField, rows: np.ndarray) -> records.Annotation:
     """Return an annotation that shows rows of a field; -1 for none."""
     shown = np.where(rows[:, None] >= 0, field.properties[rows], np.nan).astype(np.float32)
     return annotated(np.where(rows >= 0, 0, 255), properties=shown)
 
 
 @pytest.mark.parametrize(("properties", "parts"), [(1, 10), (2, 10), (3, 5), (4, 2.5)])
-def test_labels_without_classes_are_the_nearest_tenths_or_coarser_where_these_are_too_many(
-    properties, parts
-):
+def test_labels_without_classes_are_the_nearest_tenths_or_coarser(properties, parts):
     # Eleven tenths to the power of 1, 2 and 3 are 11, 121 and 1331; six fifths are 216 at the
     # third, 1296 at the fourth; and the three steps of 0, 0.4 and 0.8 are 81.
     rng = np.random.default_rng(0)
@@ -308,20 +287,14 @@ def test_an_engine_without_figures_has_those_of_a_shifted_ball():
 def test_figures_of_a_voxel_by_hand():
     others = np.array([[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]], np.float32)
     solid = np.array([[0, 0.25, 0, 0], [0, 0.65, 0, 0]], np.float32)
-    around = Surroundings(
-        others,
-        solid,
-        np.array([7.0, 1.0], np.float32),
-        np.array([0.5, 2.5], np.float32),
-        np.array([0.0, 0.25], np.float32),
-    )
+    of_voxels = np.array([[7.0, 1.0], [0.5, 2.5], [0.0, 0.25]], np.float32)
+    around = Surroundings(others, solid, *of_voxels)
     doubt, rough = -math.log(0.8 / 0.2), 0.2  # depths of -0.25 and 0.15 lie 0.2 about their mean
-    rows = [
-        dict(zip(VOXEL_FIGURES, row, strict=True)) for row in voxel_figures(around, 0.8).tolist()
-    ]
-    for row, shares, distance, depth, moved in zip(
-        rows, others.tolist(), (5.0, 1.0), (0.25, 0.15), (0.5, 2.5), strict=True
+    by_hand = (others.tolist(), (5.0, 1.0), (0.25, 0.15), (0.5, 2.5))
+    for values, shares, distance, depth, moved in zip(
+        voxel_figures(around, 0.8).tolist(), *by_hand, strict=True
     ):
+        row = dict(zip(VOXEL_FIGURES, values, strict=True))
         expected = {"distance": distance, "depth": depth, "moved": moved}
         expected |= {"asset_unsure": doubt, "asset_rough": rough}
         expected |= {"asset_distance": 3.0, "asset_moved": 1.5}
@@ -337,11 +310,9 @@ def test_figures_of_a_voxel_by_hand():
 
 
 def test_voxels_without_a_counterpart_change_no_other_voxels_confidence():
-    one = {name: values[:1] * 0 for name, values in vars(AROUND).items()}
-    far = one | {"distance": np.array([40], np.float32), "moved": np.array([9], np.float32)}
-    both = Surroundings(
-        **{name: np.concatenate([v, far[name]]) for name, v in vars(AROUND).items()}
-    )
+    far = {name: values[:1] * 0 for name, values in vars(AROUND).items()}
+    far |= {"distance": np.float32([40]), "moved": np.float32([9])}
+    both = Surroundings(*(np.concatenate([v, far[name]]) for name, v in vars(AROUND).items()))
     valid = np.arange(len(both.distance)) < len(AROUND.distance)
     alone = class_confidence(AROUND, 0.8, np.ones(len(AROUND.distance), dtype=bool))
     assert class_confidence(both, 0.8, valid).tolist() == [*alone.tolist(), 0.0]

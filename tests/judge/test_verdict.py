@@ -71,6 +71,21 @@ def test_an_asset_on_every_limit_is_good_for_no_reason():
     assert said_of(ROUGH, same_object=0.96, right_placement=0.95) == (Verdict.GOOD, ())
 
 
+@pytest.mark.parametrize(("fitness", "backward", "verdict", "word"), [
+    (THRESHOLDS.good_fitness, 1.0, Verdict.GOOD, ""),
+    (0.79, 1.0, Verdict.DOUBTFUL, "PixieVerse boundary"),
+    (1.0, 0.79, Verdict.DOUBTFUL, "SLAT boundary"),
+    (1.0, 0.64, Verdict.FAILED, "SLAT boundary"),
+    (THRESHOLDS.failed_fitness, 1.0, Verdict.DOUBTFUL, ""),
+    (0.64, 1.0, Verdict.FAILED, "64.0%"),
+])  # fmt: skip
+def test_verdicts_by_fitness_alone(fitness, backward, verdict, word):
+    given, reasons = said_of(Quality(fitness, 0.5, backward, 0.5, 0.9, 1.0), 1.0, 0.05, ties=1)
+    assert given is verdict
+    assert word in " ".join(reasons)
+    assert bool(reasons) == (verdict is not Verdict.GOOD)
+
+
 def test_a_tie_that_something_settled_is_as_good_as_its_probability():
     settled = said_of(ambiguity=0.4, same_object=0.99, right_placement=0.97)
     assert settled == (Verdict.GOOD, ())
@@ -129,18 +144,15 @@ def test_without_a_cause_none_is_named_and_the_fitness_is():
     assert reasons[0].startswith("perhaps a wrong placement")
 
 
-@pytest.mark.parametrize(
-    ("same", "placed", "verdict", "first"),
-    [
-        (0.89, 1.0, Verdict.DOUBTFUL, "perhaps another object"),
-        (0.49, 1.0, Verdict.FAILED, "probably another object"),
-        (0.5, 1.0, Verdict.DOUBTFUL, "perhaps another object"),
-        (1.0, 0.49, Verdict.FAILED, "probably a wrong placement"),
-        (1.0, 0.5, Verdict.DOUBTFUL, "perhaps a wrong placement"),
-        # Neither is improbable, though both together are.
-        (0.6, 0.7, Verdict.DOUBTFUL, "perhaps another object"),
-    ],
-)
+@pytest.mark.parametrize(("same", "placed", "verdict", "first"), [
+    (0.89, 1.0, Verdict.DOUBTFUL, "perhaps another object"),
+    (0.49, 1.0, Verdict.FAILED, "probably another object"),
+    (0.5, 1.0, Verdict.DOUBTFUL, "perhaps another object"),
+    (1.0, 0.49, Verdict.FAILED, "probably a wrong placement"),
+    (1.0, 0.5, Verdict.DOUBTFUL, "perhaps a wrong placement"),
+    # Neither is improbable, though both together are.
+    (0.6, 0.7, Verdict.DOUBTFUL, "perhaps another object"),
+])  # fmt: skip
 def test_failed_says_which_of_the_two_questions_failed(same, placed, verdict, first):
     given, reasons = said_of(worst="within_3", same_object=same, right_placement=placed)
     assert given is verdict
@@ -148,15 +160,12 @@ def test_failed_says_which_of_the_two_questions_failed(same, placed, verdict, fi
     assert reasons[0].endswith("different shapes") == ("object" in first)
 
 
-@pytest.mark.parametrize(
-    ("ties", "ambiguity", "verdict"),
-    [
-        (1, 0.06, Verdict.DOUBTFUL),  # Nothing has chosen among them yet.
-        (5, 0.06, Verdict.DOUBTFUL),
-        (0, 0.06, Verdict.FAILED),
-        (3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # As labels they are one.
-    ],
-)
+@pytest.mark.parametrize(("ties", "ambiguity", "verdict"), [
+    (1, 0.06, Verdict.DOUBTFUL),  # Nothing has chosen among them yet.
+    (5, 0.06, Verdict.DOUBTFUL),
+    (0, 0.06, Verdict.FAILED),
+    (3, THRESHOLDS.good_ambiguity, Verdict.FAILED),  # As labels they are one.
+])  # fmt: skip
 def test_a_placement_that_ties_is_not_failed(ties, ambiguity, verdict):
     given, _ = said_of(FINE, 1.0, ambiguity, ties, same_object=1.0, right_placement=0.2)
     assert given is verdict
@@ -252,15 +261,13 @@ def test_a_ball_of_one_material_is_ambiguous_and_harmless():
 def test_a_ball_with_a_painted_half_is_not_harmless():
     painted = np.where(GRID[..., 2] < 32, 1, 3)
     _, ambiguity = _ambiguity(BALL, painted)
-    # Turned upside down every voxel changes class: E by two decades, density
-    # from 200 to 400, Poisson's ratio by 0.02.
+    # Upside down every class changes: E by two decades, density from 200 to 400, nu by 0.02.
     assert ambiguity.material_share == 1.0
     np.testing.assert_allclose(ambiguity.property_change, (2.0, np.log10(2), 0.02), rtol=1e-5)
 
 
 def test_a_box_with_a_painted_end_by_hand():
-    # 40 x 20 x 10: the turns that keep it are by 180 degrees about each axis,
-    # and two of the three swap the ends.
+    # 40 x 20 x 10: half turns about each axis keep it, and two of the three swap the ends.
     box = np.zeros((64, 64, 64), dtype=bool)
     box[12:52, 22:42, 27:37] = True
     painted = np.where(GRID[..., 0] < 20, 2, 1)  # 8 of 40 layers

@@ -1,7 +1,4 @@
-"""What witnesses say: against plain loops, scipy's Gaussians, and by hand; and heard as a whole.
-
-Latents are heard where they know of classes, and silent where they do not.
-"""
+"""What witnesses say: against plain loops, scipy's Gaussians, and by hand; and heard as a whole."""
 
 from collections import defaultdict
 from collections.abc import Callable
@@ -165,9 +162,8 @@ def test_labels_are_compared_with_those_half_a_turn_away_block_by_block(classes,
     for axis in axes:
         sums: dict[tuple[int, ...], float] = defaultdict(float)
         differing, compared = set(), 0
-        for row, (voxel, own) in enumerate(
-            zip(latents.coords.astype(int).tolist(), labels.tolist(), strict=True)
-        ):
+        rows = zip(latents.coords.astype(int).tolist(), labels.tolist(), strict=True)
+        for row, (voxel, own) in enumerate(rows):
             turned = [c if k == axis else 63 - c for k, c in enumerate(voxel)]
             if own == UNANNOTATED or turned[2] - (TOP - 1) > REACH:
                 continue

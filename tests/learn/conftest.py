@@ -24,10 +24,7 @@ def _as_it_was() -> None:
 
 @pytest.fixture(scope="session")
 def learn_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build a store of nine rows: eight objects, of which one has two views.
-
-    Of ``b``, 12 voxels lie in a corner without an annotation near, so that they have no label.
-    """
+    """Build a store of eight objects, one of two views; 12 voxels of ``b`` are far from labels."""
     dataset = Dataset(tmp_path_factory.mktemp("learn")).having(*"abcdefg")
     whole, corner = dataset.assets["b"], np.argwhere(np.ones((2, 2, 3))).astype(np.uint8)
     coords = np.concatenate([whole.coords, corner])

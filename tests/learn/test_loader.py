@@ -15,32 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from slatprep import ConfigError, open_store
-from slatprep.learn import (
-    FEATS_MEAN,
-    FEATS_STD,
-    IGNORED,
-    Shares,
-    SlatDataset,
-    SlatLoader,
-    SparseBatch,
-    collate,
-    split_of,
-)
+from slatprep import ConfigError, learn, open_store
+from slatprep.learn import decoder
 from slatprep.learn.augment import lattice_symmetries
-from slatprep.learn.decoder import (
-    SIZES,
-    DecoderSize,
-    PhysicsDecoder,
-    WindowAttention,
-    embed_position,
-    make_decoder,
-    partition,
-)
 from slatprep.learn.splits import select_assets
 from slatprep.readers.splits import SPLITS, split_objects
 
-THIRDS = Shares(0.4, 0.3, 0.3)
+THIRDS = learn.Shares(0.4, 0.3, 0.3)
 
 
 def test_without_pytorch_scores_work_and_the_loader_says_what_to_install():
@@ -58,20 +39,20 @@ def test_without_pytorch_scores_work_and_the_loader_says_what_to_install():
 @given(st.text(), st.tuples(st.integers(0, 100), st.integers(1, 100), st.integers(1, 100)))
 def test_split_is_where_the_hash_falls(object_id, parts):
     total = sum(parts)
-    shares = Shares(parts[0] / total, parts[1] / total, 1 - (parts[0] + parts[1]) / total)
+    shares = learn.Shares(parts[0] / total, parts[1] / total, 1 - (parts[0] + parts[1]) / total)
     position = int(hashlib.sha256(object_id.encode()).hexdigest()[:16], 16) / 2**64
     edges = np.array([shares.train, shares.train + shares.val])
     expected = ("train", "val", "test")[int(np.searchsorted(edges, position, side="right"))]
     if np.abs(edges - position).min() > 1e-9:
-        assert split_of(object_id, shares) == expected
+        assert learn.split_of(object_id, shares) == expected
 
 
 def test_filters(learn_store):
     store = open_store(learn_store)
     good = select_assets(store, verdicts=("good",))
-    assert SlatDataset(learn_store, verdicts="good").indices.tolist() == good.tolist()
+    assert learn.SlatDataset(learn_store, verdicts="good").indices.tolist() == good.tolist()
     with pytest.raises(ConfigError, match="verdict is 'fine'; expected one of good"):
-        SlatDataset(store, verdicts="fine")
+        learn.SlatDataset(store, verdicts="fine")
     assert good.tolist() == np.flatnonzero(store.column("verdict").astype(str) == "good").tolist()
     limit = float(np.median(store.column("ambiguity")))
     kept = select_assets(store, max_ambiguity=limit)
@@ -79,15 +60,15 @@ def test_filters(learn_store):
     with pytest.raises(ConfigError, match="expected one of good, doubtful, failed"):
         select_assets(store, verdicts=("fine",))
     with pytest.raises(ConfigError, match="add up to 1"):
-        Shares(0.5, 0.1, 0.1)
+        learn.Shares(0.5, 0.1, 0.1)
     with pytest.raises(ConfigError, match="no asset"):
-        SlatDataset(store, "train", shares=Shares(0.0, 0.0, 1.0))
+        learn.SlatDataset(store, "train", shares=learn.Shares(0.0, 0.0, 1.0))
 
 
 def test_batch_is_what_zarr_reads(learn_store):
-    dataset = SlatDataset(learn_store)
-    batch = collate([dataset[k] for k in range(3)])
-    assert next(iter(SlatLoader(str(learn_store), 3))).asset_ids == batch.asset_ids
+    dataset = learn.SlatDataset(learn_store)
+    batch = learn.collate([dataset[k] for k in range(3)])
+    assert next(iter(learn.SlatLoader(str(learn_store), 3))).asset_ids == batch.asset_ids
     root = zarr.open_group(learn_store, mode="r")
     offset = np.asarray(root["asset/offset"])
     rows = np.s_[: offset[3]]
@@ -95,21 +76,19 @@ def test_batch_is_what_zarr_reads(learn_store):
     assert batch.coords.dtype == torch.int32
     assert batch.coords[:, 0].tolist() == np.repeat(range(3), np.diff(offset[:4])).tolist()
     np.testing.assert_array_equal(batch.coords[:, 1:], root["voxel/coords"][rows])
-    feats = (root["voxel/feats"][rows] - np.array(FEATS_MEAN)) / np.array(FEATS_STD)
+    feats = (root["voxel/feats"][rows] - np.array(learn.FEATS_MEAN)) / np.array(learn.FEATS_STD)
     np.testing.assert_allclose(batch.feats, feats, rtol=1e-5, atol=1e-6)
     valid = root["voxel/valid"][rows]
     np.testing.assert_array_equal(batch.valid, valid)
-    np.testing.assert_array_equal(
-        batch.properties, np.nan_to_num(root["voxel/properties"][rows], nan=0.0)
-    )
-    material = np.where(valid, root["voxel/material"][rows].astype(int), IGNORED)
+    properties = np.nan_to_num(root["voxel/properties"][rows])
+    np.testing.assert_array_equal(batch.properties, properties)
+    material = np.where(valid, root["voxel/material"][rows].astype(int), learn.IGNORED)
     np.testing.assert_array_equal(batch.material, material)
-    assert [(s.start, s.stop) for s in batch.layout] == list(
-        zip(offset[:3].tolist(), offset[1:4].tolist(), strict=True)
-    )
+    spans = list(itertools.pairwise(offset[:4].tolist()))
+    assert [(s.start, s.stop) for s in batch.layout] == spans
 
 
-def epochs(loader: SlatLoader, *chosen: int) -> list[SparseBatch]:
+def epochs(loader: learn.SlatLoader, *chosen: int) -> list[learn.SparseBatch]:
     batches = []
     for epoch in chosen:
         loader.set_epoch(epoch)
@@ -120,9 +99,9 @@ def epochs(loader: SlatLoader, *chosen: int) -> list[SparseBatch]:
 # Each epoch has workers of its own, and those that are spawned import PyTorch.
 @pytest.mark.parametrize(("workers", "method", "first"), [(2, "fork", 0), (1, "spawn", 1)])
 def test_workers_change_nothing(learn_store, workers, method, first):
-    dataset = SlatDataset(learn_store, augmentation="all", seed=3)
-    alone = epochs(SlatLoader(dataset, 2, shuffle=True), 0, 1)
-    with_workers = SlatLoader(dataset, 2, shuffle=True, workers=workers, start_method=method)
+    dataset = learn.SlatDataset(learn_store, augmentation="all", seed=3)
+    alone = epochs(learn.SlatLoader(dataset, 2, shuffle=True), 0, 1)
+    with_workers = learn.SlatLoader(dataset, 2, shuffle=True, workers=workers, start_method=method)
     shared = epochs(with_workers, *range(first, 2))
     for ours, theirs in zip(alone[5 * first :], shared, strict=True):
         assert ours.asset_ids == theirs.asset_ids
@@ -146,11 +125,14 @@ def test_symmetries_are_the_groups_they_should_be():
 @pytest.mark.parametrize("kind", [None, "Upright", "al"])
 def test_an_unknown_augmentation_is_refused(learn_store, kind):
     with pytest.raises(ConfigError, match="expected one of none, upright, all"):
-        SlatDataset(learn_store, augmentation=kind)
+        learn.SlatDataset(learn_store, augmentation=kind)
 
 
 def test_augmentation_moves_coordinates_and_nothing_else(learn_store):
-    plain, turned = SlatDataset(learn_store), SlatDataset(learn_store, augmentation="all", seed=1)
+    plain, turned = (
+        learn.SlatDataset(learn_store),
+        learn.SlatDataset(learn_store, augmentation="all", seed=1),
+    )
     moved = 0
     for k in range(len(plain)):
         for name in ("feats", "properties", "material", "valid"):
@@ -167,21 +149,20 @@ def test_no_split_is_empty_where_there_are_as_many_objects(objects):
     splits = split_objects(objects)
     assert splits.keys() == objects
     assert len(set(splits.values())) == min(len(objects), 3)
-    by_hash = {object_id: split_of(object_id) for object_id in objects}
+    by_hash = {object_id: learn.split_of(object_id) for object_id in objects}
     if len(set(by_hash.values())) == 3:
         assert splits == by_hash
-    assert "val" not in split_objects(objects, Shares(0.5, 0.0, 0.5)).values()
+    assert "val" not in split_objects(objects, learn.Shares(0.5, 0.0, 0.5)).values()
 
 
 def test_splits_part_the_store_keep_views_together_and_do_not_depend_on_filters(learn_store):
     store = open_store(learn_store)
     ambiguity = np.sort(store.column("ambiguity"))
     views = {store.find("h.front"), store.find("h.side")}
-    for shares in (THIRDS, Shares(), Shares(0.02, 0.96, 0.02)):
+    for shares in (THIRDS, learn.Shares(), learn.Shares(0.02, 0.96, 0.02)):
         whole = {s: select_assets(store, s, shares=shares).tolist() for s in SPLITS}
-        assert all(whole.values()) and sorted(itertools.chain(*whole.values())) == [
-            *range(len(store))
-        ]
+        rows = sorted(itertools.chain(*whole.values()))
+        assert all(whole.values()) and rows == [*range(len(store))]
         assert [len(views & set(part)) for part in whole.values()].count(2) == 1
         for limit, split in itertools.product((ambiguity[0], ambiguity[4]), SPLITS):
             some = select_assets(store, split, shares=shares, max_ambiguity=float(limit))
@@ -196,18 +177,18 @@ def test_voxels_that_are_not_sure_enough_are_left_out(learn_store, tmp_path):
     spread = np.concatenate([asset.confidence[asset.valid] for asset in store])
     least = float(np.median(spread))
     assert (spread >= least).any() and (spread < least).any()
-    everything, sure = SlatDataset(store), SlatDataset(store, min_confidence=least)
+    everything, sure = learn.SlatDataset(store), learn.SlatDataset(store, min_confidence=least)
     for number, asset_id in enumerate(sure.asset_ids):
         asset, item, whole = store.asset(asset_id), sure[number], everything[number]
         kept = asset.valid & (asset.confidence >= least)
         np.testing.assert_array_equal(item.valid.numpy(), kept)
         np.testing.assert_array_equal(whole.valid.numpy(), asset.valid)
         np.testing.assert_array_equal(item.confidence.numpy(), asset.confidence)
-        np.testing.assert_array_equal(item.material.numpy() != IGNORED, kept)
+        np.testing.assert_array_equal(item.material.numpy() != learn.IGNORED, kept)
         assert not item.properties.numpy()[~kept].any()
 
 
-TINY = DecoderSize(24, 2, 2)
+TINY = decoder.DecoderSize(24, 2, 2)
 
 
 def voxels(count: int, seed: int, batch: int = 0, extent: int = 64) -> tuple[Tensor, Tensor]:
@@ -219,9 +200,9 @@ def voxels(count: int, seed: int, batch: int = 0, extent: int = 64) -> tuple[Ten
 
 
 @pytest.fixture
-def model() -> PhysicsDecoder:
+def model() -> decoder.PhysicsDecoder:
     torch.manual_seed(0)
-    made = PhysicsDecoder(TINY)
+    made = decoder.PhysicsDecoder(TINY)
     # The heads begin at 0, which would hide everything before them.
     for head in (made.regression, made.classification):
         torch.nn.init.xavier_uniform_(head.weight)
@@ -230,19 +211,19 @@ def model() -> PhysicsDecoder:
 
 @pytest.mark.parametrize(("size", "millions"), [("small", 0.20), ("medium", 1.19), ("large", 6.32)])
 def test_parameters_are_as_many_as_the_paper_says(size, millions):
-    parameters = sum(p.numel() for p in make_decoder(size).parameters())
+    parameters = sum(p.numel() for p in decoder.make_decoder(size).parameters())
     assert parameters / 1e6 == pytest.approx(millions, abs=0.0051)
-    assert set(SIZES) >= {"small", "medium", "large"}
+    assert set(decoder.SIZES) >= {"small", "medium", "large"}
 
 
 @pytest.mark.parametrize("shift", [0, 4])
 def test_attention_equals_a_dense_reference(shift):
     torch.manual_seed(0)
-    attention = WindowAttention(24, 2)
+    attention = decoder.WindowAttention(24, 2)
     coords, _ = voxels(300, 3, extent=24)
     coords[150:, 0] = 1
     hidden = torch.randn(300, 24)
-    sparse = attention(hidden, partition(coords, shift))
+    sparse = attention(hidden, decoder.partition(coords, shift))
     # Every pair, then a softmax over those that share batch and window.
     place = [(int(b), *((int(i) + shift) // 8 for i in voxel)) for b, *voxel in coords]
     same = torch.tensor([[a == b for b in place] for a in place])
@@ -270,7 +251,7 @@ def test_positions_are_told_apart(channels):
     for k in range(3):
         coords = torch.zeros(64, 3, dtype=torch.int32)
         coords[:, k] = axis
-        waves = embed_position(coords, channels)
+        waves = decoder.embed_position(coords, channels)
         assert waves.shape == (64, channels)
         assert (torch.cdist(waves, waves) + torch.eye(64)).min() > 0.1
 

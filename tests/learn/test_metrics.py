@@ -25,7 +25,7 @@ from slatprep.learn.metrics import METRICS, OURS, average_methods, evaluate_stor
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 from slatprep.learn.splits import assign_store
 from slatprep.normalize import PIXIE_RANGES
-from slatprep.parameters import BuildParameters, NormalizeParameters, SampleParameters
+from slatprep.parameters import BuildParameters, NormalizeParameters
 from slatprep.pipeline.dataset import build_store
 
 
@@ -118,18 +118,15 @@ def test_command(learn_store, predicted, tmp_path):
     assert last["method"] == "all" and last["means"] == pytest.approx(means)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("method,log10 E,accuracy\nmine,0.1,\n", None),
-        ("method,E\nmine,0.1\n", "has the columns method, E"),
-        ("method,mean\nmine,good\n", "not numbers"),
-        ("method,nu,mean\nmine,0.1\n", "not numbers"),
-        ("", "cannot be read"),
-        ("method,nu,nu\nmine,0.1,0.2\n", "has the column nu twice"),
-        ("method,nu\nmine,0,1\n", "has 3 entries under 2 columns, for 'mine'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("method,log10 E,accuracy\nmine,0.1,\n", None),
+    ("method,E\nmine,0.1\n", "has the columns method, E"),
+    ("method,mean\nmine,good\n", "not numbers"),
+    ("method,nu,mean\nmine,0.1\n", "not numbers"),
+    ("", "cannot be read"),
+    ("method,nu,nu\nmine,0.1,0.2\n", "has the column nu twice"),
+    ("method,nu\nmine,0,1\n", "has 3 entries under 2 columns, for 'mine'"),
+])  # fmt: skip
 def test_own_tables(tmp_path, text, message):
     path = tmp_path / "own.csv"
     path.write_text(text)
@@ -182,27 +179,20 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         grid[inside, 1] *= 10 ** rng.normal(0, 2, inside.sum())
         dataset.write_grid(name, grid)
     store = folder / "s.zarr"
-    parameters = replace(
-        dataset.parameters(),
-        normalize=NormalizeParameters("pixie"),
-        sample=SampleParameters(method="nearest"),
-    )
+    parameters = dataset.parameters("pixie", sample={"method": "nearest"})
     build_store(parameters, store)
     predicted = {}
-    for name in NAMES:
+    grids, cube = {name: dataset.assets[name].grid for name in NAMES}, (64, 64, 64)
+    for name, grid in grids.items():
         # A network's output: not clipped, and of the wrong class, background too, here and there.
-        grid = dataset.assets[name].grid
-        values = normalized(grid) + rng.normal(0, 0.4, (64, 64, 64, 3))
-        classes = np.where(rng.random((64, 64, 64)) < 0.3, rng.integers(0, 8, (64, 64, 64)),
-                           grid[..., 3])  # fmt: skip
-        predicted[name] = np.concatenate([values, classes[..., None]], axis=-1).astype(np.float32)
-    for name, grid in predicted.items():
-        hot = (grid[..., 3:] == np.arange(8)).astype(np.float32)
-        channels = np.concatenate([grid[..., :3], hot], axis=-1)
-        path = folder / "eleven" / name / "sample_0_pred.npy"
-        written(path, np.ascontiguousarray(np.moveaxis(channels, -1, 0)))
-        written(folder / "four" / f"{name}.npy", np.moveaxis(grid, -1, 0).copy())
-    grids = {name: dataset.assets[name].grid for name in NAMES}
+        values = normalized(grid) + rng.normal(0, 0.4, (*cube, 3))
+        classes = np.where(rng.random(cube) < 0.3, rng.integers(0, 8, cube), grid[..., 3])
+        own = np.concatenate([values, classes[..., None]], axis=-1).astype(np.float32)
+        channels = np.concatenate([own[..., :3], own[..., 3:] == np.arange(8)], axis=-1)
+        eleven = np.moveaxis(channels.astype(np.float32), -1, 0)
+        written(folder / "eleven" / name / "sample_0_pred.npy", np.ascontiguousarray(eleven))
+        written(folder / "four" / f"{name}.npy", np.moveaxis(own, -1, 0).copy())
+        predicted[name] = own
     return Case(parameters, store, grids, predicted, folder / "eleven")
 
 
@@ -275,10 +265,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "short": (lambda path: path.write_bytes(path.read_bytes()[:-8]) and None, "truncated"),
     "shape": (lambda path: np.save(path, np.zeros((11, 32, 32, 32), np.float32)), "has shape"),
     "class": (lambda path: np.save(path, np.full((4, 64, 64, 64), 9.0)), "unknown class 9"),
-    "two": (
-        lambda path: shutil.copy(path, path.with_name("sample_1_pred.npy")) and None,
-        "2 samples",
-    ),
+    "two": (lambda path: shutil.copy(path, path.with_name("sample_1_pred.npy")), "2 samples"),
 }
 
 
@@ -322,17 +309,14 @@ def test_side_by_side_on_the_same_objects(case, tmp_path):
     assert {m["objects"] for m in document["methods"].values()} == {len(NAMES) - 1}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((), "nothing to measure"),
-        (("--grids", "nowhere"), "is no folder"),
-        (("--grids", "{results}", "--grids", "{results}"), "two folders are called 'eleven'"),
-        (("{results}", "--picture", "x.png"), "--picture draws methods"),
-        (("--grids", "={results}"), "has no name before ="),
-        (("--grids", "{results}", "--picture", "x.gif"), "x.gif ends in none of .png, .svg, .pdf"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    ((), "nothing to measure"),
+    (("--grids", "nowhere"), "is no folder"),
+    (("--grids", "{results}", "--grids", "{results}"), "two folders are called 'eleven'"),
+    (("{results}", "--picture", "x.png"), "--picture draws methods"),
+    (("--grids", "={results}"), "has no name before ="),
+    (("--grids", "{results}", "--picture", "x.gif"), "x.gif ends in none of .png, .svg, .pdf"),
+])  # fmt: skip
 def test_what_cannot_be_compared_is_said(case, arguments, message):
     filled = (argument.format(results=case.results) for argument in arguments)
     assert message in refused("evaluate", *filled, "--store", case.store)
@@ -360,16 +344,13 @@ def test_occupied_voxels_without_a_class_are_counted(make_dataset, tmp_path):
     assert "have no annotation and are not scored: 1;" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda grid: np.moveaxis(grid, -1, 0), "a prediction, channels first, is normalised"),
-        (lambda grid: grid / [1e3, 1e9, 1, 1], "look like GPa and g/cm"),
-        (lambda grid: grid * [1, 1, 100, 1], "Poisson's ratio"),
-        # What no material has is a prediction nevertheless.
-        (lambda grid: np.where(grid[..., 3:] == 7, grid, [7850, 2e6, 0.3, 1]), None),
-    ],
-)
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda grid: np.moveaxis(grid, -1, 0), "a prediction, channels first, is normalised"),
+    (lambda grid: grid / [1e3, 1e9, 1, 1], "look like GPa and g/cm"),
+    (lambda grid: grid * [1, 1, 100, 1], "Poisson's ratio"),
+    # What no material has is a prediction nevertheless.
+    (lambda grid: np.where(grid[..., 3:] == 7, grid, [7850, 2e6, 0.3, 1]), None),
+])  # fmt: skip
 def test_values_that_are_no_prediction_are_refused(case, tmp_path, change, words):
     for name in NAMES:
         written(tmp_path / f"{name}.npy", change(case.grids[name].astype(np.float64)))

@@ -78,9 +78,8 @@ def test_a_prediction_is_the_decoder_s_and_its_units_follow_by_hand(checkpoint):
         said = model(torch.from_numpy(rows), torch.from_numpy(feats.astype(np.float32)))
     np.testing.assert_allclose(field.properties, said.properties.numpy(), atol=1e-5)
     scores = np.exp(said.logits.numpy().astype(np.float64))
-    np.testing.assert_allclose(
-        field.probabilities, scores / scores.sum(axis=1, keepdims=True), atol=1e-5
-    )
+    scores /= scores.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(field.probabilities, scores, atol=1e-5)
     assert np.array_equal(field.material, field.probabilities[:, :7].argmax(axis=1))
     mapped = RANGES[:, 0] + (field.properties + 1) / 2 * (RANGES[:, 1] - RANGES[:, 0])
     expected = np.concatenate([10 ** mapped[:, :2], mapped[:, 2:]], axis=1)
@@ -203,9 +202,8 @@ def trellis(monkeypatch: pytest.MonkeyPatch) -> Mock:
     pipeline.configure_mock(**{f"{name}_params": {} for name in stated})
     pipeline.preprocess_image.side_effect = lambda image: image
     coords = torch.from_numpy(np.insert(latents.coords.astype(np.int32), 0, 0, axis=1))
-    pipeline.sample_slat.return_value = SimpleNamespace(
-        coords=coords, feats=torch.from_numpy(latents.feats)
-    )
+    slat = SimpleNamespace(coords=coords, feats=torch.from_numpy(latents.feats))
+    pipeline.sample_slat.return_value = slat
 
     def decode_slat(slat: Any, formats: list[str]) -> dict[str, list[Any]]:
         assert formats == ["gaussian"]
@@ -284,10 +282,8 @@ def test_each_step_alone_comes_to_what_the_one_line_does(checkpoint, tmp_path, t
     assert stepped.read_bytes() == at_once.read_bytes()
 
 
-def test_gaussians_of_stored_latents_and_of_standardised_ones(
-    learn_store, tmp_path, trellis, monkeypatch
-):
-    """The decoder gets latents as TRELLIS draws them, whatever was done to those that are saved."""
+def test_decoders_get_latents_as_trellis_draws_them(learn_store, tmp_path, trellis, monkeypatch):
+    """Whatever was done to those that are stored or saved."""
     slats, out = tmp_path / "slat", tmp_path / "gaussians"
     step("decode-slat", learn_store, "--asset", "a", "--out", out)
     assert [path.name for path in out.iterdir()] == ["a.ply"]

@@ -63,6 +63,14 @@ def weights_of(path: Path) -> dict[str, torch.Tensor]:
     return model
 
 
+def shown(run: Path, name: str) -> list[tuple[int, float]]:
+    """Return the steps and values of a curve as TensorBoard shows it."""
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulator.EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    return [(event.step, event.value) for event in events.Scalars(name)]
+
+
 def test_a_stopped_run_goes_on_to_the_same_bits(learn_store, tmp_path, monkeypatch):
     """Stopped within an epoch, after its last batch but one, and between two epochs."""
     whole = train(learn_store, tmp_path / "whole", SHORT)
@@ -105,19 +113,13 @@ def test_a_stopped_run_goes_on_to_the_same_bits(learn_store, tmp_path, monkeypat
     torch.save(state, tmp_path / "parts" / LAST)
     with pytest.raises(InputError, match=r"last\.pt.*ends after batch"):
         train(learn_store, tmp_path / "parts", SHORT)
-    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    events = accumulator.EventAccumulator(str(tmp_path / "parts" / "tensorboard"))
-    events.Reload()
     for name in ("learning_rate", "train_loss", "val_loss", "val_mse", "val_accuracy"):
-        read = [(event.step, event.value) for event in events.Scalars(name)]
         logged = [(one.epoch, pytest.approx(getattr(one, name))) for one in resumed.history]
-        assert read == logged, name
+        assert shown(tmp_path / "parts", name) == logged, name
 
 
 @pytest.mark.parametrize("killed", range(3))
-def test_a_run_killed_at_the_end_of_an_epoch_goes_on_with_the_weights_it_names(
-    learn_store, tmp_path, monkeypatch, killed
-):
+def test_a_killed_run_goes_on_with_the_weights_it_names(learn_store, tmp_path, monkeypatch, killed):
     """Before each of the three writes of the end of an epoch, the only one."""
     one, left = dataclasses.replace(SHORT, epochs=1), [killed]
 
@@ -140,10 +142,7 @@ def test_a_run_killed_at_the_end_of_an_epoch_goes_on_with_the_weights_it_names(
     last, best = (weights_of(tmp_path / name) for name in (LAST, BEST))
     assert all(torch.equal(last[key], best[key]) for key in last)
     assert len((tmp_path / "log.csv").read_text().splitlines()) == 2
-    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    events = accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
-    assert [event.step for event in events.Scalars("train_loss")] == [0]
+    assert [step for step, _ in shown(tmp_path, "train_loss")] == [0]
 
 
 def test_wrong_runs_are_named(learn_store, tmp_path):
@@ -386,16 +385,12 @@ def test_evaluate_outside_a_run_says_which_split_it_takes(learn_store, tmp_path)
 
 @pytest.mark.parametrize("steps", [1, 3, 4])
 def test_steps_end_where_they_are_told_to(learn_store, tmp_path, steps):
-    chosen = TrainParameters(
-        size="tiny", steps=steps, epochs=1, batch_size=1, accumulate=2, learning_rate=2e-3,
-        shares=Shares(0.4, 0.3, 0.3), keep="last",
-    )  # fmt: skip
-    batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=chosen.shares), 1))
+    chosen = dataclasses.replace(SHORT, steps=steps, epochs=1, keep="last")
+    batches = len(SlatLoader(SlatDataset(learn_store, "train", shares=SHARES), 1))
     per_epoch = math.ceil(batches / 2)
     seen: list[tuple[int, int]] = []
-    history = train(
-        learn_store, tmp_path / "run", chosen, steps=lambda *done: seen.append(done)
-    ).history
+    trained = train(learn_store, tmp_path / "run", chosen, steps=lambda *done: seen.append(done))
+    history = trained.history
     assert len(history) == math.ceil(steps / per_epoch)
     # The cosine ends with the last step, and the log has the rate of each pass's last one.
     ends = [min(steps, (k + 1) * per_epoch) - 1 for k in range(len(history))]

@@ -18,19 +18,8 @@ from support.commands import document, run
 from support.synthetic import JELLY, METAL, make_asset
 
 from slatprep.errors import SlatprepError
-from slatprep.particles import motion
+from slatprep.particles import gaussians, motion
 from slatprep.particles.fields import VoxelField
-from slatprep.particles.gaussians import (
-    bind,
-    carry,
-    colours_of,
-    deform,
-    draw,
-    gaussians_of,
-    rotations,
-    write_gaussians,
-    write_picture,
-)
 from slatprep.particles.read import SAVED_AXES
 from slatprep.particles.simulate import AIR, simulate_motion, windward
 from slatprep.store import open_store
@@ -118,9 +107,7 @@ def test_the_wind_meets_the_shadow_of_what_is_convex(seed):
     assert not windward(box, np.zeros(3), SPACING).any()
 
 
-# `make simulate` runs these with the real engine, as a job of continuous integration does. They
-# are not in `make test`: Newton with warp-lang is 0.5 GB, and its kernels compile for a minute or
-# two of CPU time before the first step, on every new machine.
+# `make simulate` runs these with the real engine, as a job of continuous integration does.
 needs_newton = pytest.mark.skipif(
     importlib.util.find_spec("newton") is None,
     reason="needs the extra `simulate`: 0.5 GB, and minutes to compile; see make simulate",
@@ -214,7 +201,7 @@ ROTATION, SCALE = [f"rot_{i}" for i in (1, 2, 3, 0)], [f"scale_{i}" for i in ran
 def random_gaussians(count: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     places = rng.uniform(REST.min(axis=0), REST.max(axis=0), (count, 3))
-    made = gaussians_of(places, rng.integers(0, 7, count).astype(np.uint8), H)
+    made = gaussians.gaussians_of(places, rng.integers(0, 7, count).astype(np.uint8), H)
     drawn = [*Rotation.random(count, rng=rng).as_quat().T, *rng.normal(-4, 0.5, (3, count))]
     for name, values in zip([*ROTATION, *SCALE], drawn, strict=True):
         made[name] = values
@@ -241,15 +228,15 @@ def test_a_rigid_motion_moves_and_turns_each_gaussian_exactly(axes, seed):
     saved = random_gaussians(50, seed)
     places = columns(saved) @ SAVED_AXES[axes]  # of the file, to the SLAT frame
     motion = np.tile(turn, (len(REST), 1, 1))
-    moved, gradients = carry(bind(places, REST, H), REST @ turn.T + shift, motion)
+    carrier = gaussians.bind(places, REST, H)
+    moved, gradients = gaussians.carry(carrier, REST @ turn.T + shift, motion)
     np.testing.assert_allclose(moved, places @ turn.T + shift, atol=1e-9)
-    rows = deform(saved, moved, gradients, axes)
+    rows = gaussians.deform(saved, moved, gradients, axes)
     np.testing.assert_allclose(columns(rows) @ SAVED_AXES[axes], moved, atol=1e-6)
     # A renderer sees the same covariance, turned in the axes of the file.
     in_file = SAVED_AXES[axes] @ turn @ SAVED_AXES[axes].T
-    np.testing.assert_allclose(
-        covariances(rows), in_file @ covariances(saved) @ in_file.T, rtol=1e-4, atol=1e-8
-    )
+    expected = in_file @ covariances(saved) @ in_file.T
+    np.testing.assert_allclose(covariances(rows), expected, rtol=1e-4, atol=1e-8)
     changed = {"x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3"}
     for name in set(saved.dtype.names or ()) - changed:
         np.testing.assert_array_equal(rows[name], saved[name])
@@ -261,13 +248,13 @@ def test_an_affine_motion_deforms_covariances_where_asked(seed):
     affine = np.eye(3) + rng.uniform(-0.25, 0.25, (3, 3))
     saved = random_gaussians(40, seed)
     motion = np.tile(affine, (len(REST), 1, 1))
-    carrier = bind(columns(saved), REST, H)
-    moved, gradients = carry(carrier, REST @ affine.T, motion)
+    carrier = gaussians.bind(columns(saved), REST, H)
+    moved, gradients = gaussians.carry(carrier, REST @ affine.T, motion)
     np.testing.assert_allclose(moved, columns(saved) @ affine.T, atol=1e-9)
-    rows = deform(saved, moved, gradients, "slat", stretch=True)
+    rows = gaussians.deform(saved, moved, gradients, "slat", stretch=True)
     expected = affine @ covariances(saved) @ affine.T
     np.testing.assert_allclose(covariances(rows), expected, rtol=2e-3, atol=1e-8)
-    turned = rotations(gradients)
+    turned = gaussians.rotations(gradients)
     eyes = np.broadcast_to(np.eye(3), turned.shape)
     np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), eyes, atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(turned), 1.0)
@@ -275,7 +262,7 @@ def test_an_affine_motion_deforms_covariances_where_asked(seed):
 
 def test_files_of_gaussians_keep_every_field(tmp_path):
     saved = random_gaussians(30)
-    write_gaussians(tmp_path / "g.ply", saved, "frame SLAT, unit cube -0.5..0.5, z up")
+    gaussians.write_gaussians(tmp_path / "g.ply", saved, "frame SLAT, unit cube -0.5..0.5, z up")
     vertex = plyfile.PlyData.read(tmp_path / "g.ply")["vertex"].data
     np.testing.assert_array_equal(vertex, saved)
 
@@ -283,16 +270,16 @@ def test_files_of_gaussians_keep_every_field(tmp_path):
 def test_the_nearest_gaussian_is_drawn_in_its_colour(tmp_path):
     # Seen from the front, y grows away from the eye.
     places = np.array([[0.0, -0.3, 0.0], [0.0, 0.3, 0.16], [0.3, 0.0, 0.3]])
-    rows = gaussians_of(places, np.array([0, 1, 2], np.uint8), 0.4)
+    rows = gaussians.gaussians_of(places, np.array([0, 1, 2], np.uint8), 0.4)
     rows["opacity"][2] = -6.0  # As good as transparent.
     for name in SCALE:
         rows[name] = np.log(0.08)
-    picture = draw(rows, places, np.full(3, -0.5), np.full(3, 0.5), pixels=100)
+    picture = gaussians.draw(rows, places, np.full(3, -0.5), np.full(3, 0.5), pixels=100)
     seen = {tuple(colour) for colour in picture.reshape(-1, 3)}
-    front = tuple((colours_of(rows)[0] * 255).astype(np.uint8))
+    front = tuple((gaussians.colours_of(rows)[0] * 255).astype(np.uint8))
     assert front in seen and len(seen) == 3  # paper, the front one, the shaded one behind
     for suffix in ("png", "gif"):
-        write_picture(tmp_path / f"a.{suffix}", [picture, picture[::-1].copy()], 20)
+        gaussians.write_picture(tmp_path / f"a.{suffix}", [picture, picture[::-1].copy()], 20)
     with Image.open(tmp_path / "a.gif") as animation:
         assert animation.n_frames == 2
 
@@ -340,9 +327,10 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path):
 def test_gaussians_of_trellis_fall_as_the_object_does(tmp_path):
     coords = write_prediction(tmp_path / "p.npz")
     places = (coords[::3] + 0.5) / 64 - 0.5
-    saved = gaussians_of(places @ SAVED_AXES["trellis"].T, np.zeros(len(places), np.uint8), 1 / 64)
+    classes = np.zeros(len(places), np.uint8)
+    saved = gaussians.gaussians_of(places @ SAVED_AXES["trellis"].T, classes, 1 / 64)
     saved["nx"] = np.arange(len(saved))
-    write_gaussians(tmp_path / "g.ply", saved, "by nobody")
+    gaussians.write_gaussians(tmp_path / "g.ply", saved, "by nobody")
     size, rate = 0.4, 40
     told = document(
         "simulate", "--gaussians", tmp_path / "g.ply", "--prediction", tmp_path / "p.npz",
@@ -400,9 +388,8 @@ def test_picture_shows_the_jelly_strained_and_the_steel_not(made, tmp_path, monk
     strains = np.stack([strain(rest, frame, material, 1 / 32) for frame in frames])
     asset = open_store(made[0] / "drop.zarr").asset("drop")
     parts = [drop_picture.Part(number, "", shiny=number == 1) for number in (0, 1)]
-    drop_picture.draw(
-        tmp_path / "drop.png", positions, frames, strains, material, asset, parts, (0, 1)
-    )
+    drawn = (positions, frames, strains, material, asset, parts, (0, 1))
+    drop_picture.draw(tmp_path / "drop.png", *drawn)
     with Image.open(tmp_path / "drop.png") as image:
         pixels = np.asarray(image.convert("RGB"), dtype=int)
     # Strain is drawn reddish; light and shadow on what is at rest are grey.
@@ -427,9 +414,7 @@ def test_a_short_run_is_drawn_within_its_frames():
     (scenes, ["--prediction", "p.npz", "--seconds", "0"], "--seconds of a frame at least"),
     (scenes, ["--prediction", "nowhere.npz"], "nowhere.npz"),
 ])  # fmt: skip
-def test_what_cannot_be_done_is_said_in_a_line(
-    example, arguments, said, tmp_path, monkeypatch, capsys
-):
+def test_what_fails_is_said_in_a_line(example, arguments, said, tmp_path, monkeypatch, capsys):
     if "{store}" in arguments:
         monkeypatch.setattr(drop, "JELLY", (2, *drop.JELLY[1:]))  # sand
         arguments = [str(drop.make_store(tmp_path)) if a == "{store}" else a for a in arguments]

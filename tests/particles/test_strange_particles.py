@@ -33,9 +33,8 @@ def test_lists_are_no_fault_beside_the_coordinates_alone(tmp_path):
     elements = f"element vertex 1\n{XYZ}property list uchar float w\n"
     read = read_particles(_ply(tmp_path / "p.ply", elements, body))
     assert read.positions.shape == (1, 3)
-    refused(
-        _ply(tmp_path / "p.ply", elements.replace("float x", "list uchar float x"), body), "list"
-    )
+    lists = elements.replace("float x", "list uchar float x")
+    refused(_ply(tmp_path / "p.ply", lists, body), "list")
 
 
 @pytest.mark.parametrize("rows", ["10000000000", "9" * 30])
@@ -47,19 +46,19 @@ def test_more_rows_than_bytes_are_refused_before_they_are_set_aside(element, for
     refused(file, "announces more rows than it has")
 
 
-@pytest.mark.parametrize(
-    "elements",
-    [
-        "element junk 300_000_000\nproperty list uchar int q\n",
-        "element junk +1000000000\nproperty uchar q\n",
-        "element vertex 1\nproperty float x\ncomment " + "c" * 70_000 + "\n"
-        "element junk 1000000000\nproperty list uchar int q\n",
-        "comment " + "c" * 70_000 + "\nelement junk 1000000000\nproperty uchar q\n",
-        "element junk 40\nproperty double q\n",
-        "element junk -1\nproperty double q\n",
-    ],
-    ids=["underscores", "a sign", "behind the vertices", "long comments", "wide rows", "below 0"],
-)
+LONG = f"comment {'c' * 70_000}\n"
+JUNK = {
+    "underscores": "element junk 300_000_000\nproperty list uchar int q\n",
+    "a sign": "element junk +1000000000\nproperty uchar q\n",
+    "behind the vertices": f"element vertex 1\nproperty float x\n{LONG}"
+    "element junk 1000000000\nproperty list uchar int q\n",
+    "long comments": f"{LONG}element junk 1000000000\nproperty uchar q\n",
+    "wide rows": "element junk 40\nproperty double q\n",
+    "below 0": "element junk -1\nproperty double q\n",
+}
+
+
+@pytest.mark.parametrize("elements", JUNK.values(), ids=JUNK)
 def test_a_small_file_takes_little_memory_whatever_it_announces(elements, tmp_path):
     file = _ply(tmp_path / "p.ply", elements + f"element vertex 1\n{XYZ}", b"\0" * 100)
     refused(file, r"p\.ply: .*(more rows than it has|rows below 0|fields x, y and z)", 20e6)
@@ -85,10 +84,8 @@ def test_millions_of_short_rows_are_refused_before_they_are_read(form, tmp_path)
     ids=["a header behind a comment", "a line without end", "many short values"],
 )  # fmt: skip
 def test_text_costs_no_more_than_its_size(elements, body, said, tmp_path):
-    file = _ply(
-        tmp_path / "p.ply", elements.replace("vertex 1\n", f"vertex 1\n{XYZ}"), body, "ascii"
-    )
-    refused(file, said, 30e6)
+    elements = elements.replace("vertex 1\n", f"vertex 1\n{XYZ}")
+    refused(_ply(tmp_path / "p.ply", elements, body, "ascii"), said, 30e6)
 
 
 def test_a_large_file_is_refused_without_a_copy(tmp_path):
@@ -136,10 +133,8 @@ def test_a_pipe_is_not_waited_for(name, tmp_path):
 
 
 def test_an_archive_that_claims_more_particles_than_there_can_be_is_refused(tmp_path):
-    head = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        head, {"descr": "<f8", "fortran_order": False, "shape": (10**10, 3)}
-    )
+    head, claim = io.BytesIO(), {"descr": "<f8", "fortran_order": False, "shape": (10**10, 3)}
+    np.lib.format.write_array_header_1_0(head, claim)
     with zipfile.ZipFile(tmp_path / "p.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("xyz.npy", head.getvalue() + bytes(10**6))
     refused(tmp_path / "p.npz", r"\(10000000000, 3\); expected shape")

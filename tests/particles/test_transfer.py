@@ -71,18 +71,14 @@ def particles_near(coords: np.ndarray, count: int, reach: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("tool", ["trellis", "sam3d"])
-def test_gaussians_of_either_tool_get_the_material_of_their_voxel(
-    tool, store, true_parts, tmp_path
-):
+def test_gaussians_get_the_material_of_their_voxel(tool, store, true_parts, tmp_path):
     coords, material = true_parts
     positions = particles_near(coords, 3000, 0.45)
     saved = (write_gaussians if tool == "trellis" else as_sam3d)(tmp_path / "g.ply", positions)
     words = ("--store", store, "--asset", "cup", "--out")
     summary = run(tmp_path / "g.ply", *words, tmp_path / "m.ply")
     assert summary["axes"] == ("trellis" if tool == "trellis" else "slat") and summary["far"] == 0
-    told = commands.run(
-        "transfer", tmp_path / "g.ply", *words, tmp_path / "s.ply", "--frame", "slat"
-    )
+    told = commands.run("transfer", tmp_path / "g.ply", *words, tmp_path / "s.ply", "--frame=slat")
     assert ("read as SAM 3D Objects saves them" in told.stderr) == (tool == "sam3d")
 
     # Row for row the Gaussians of the file, so that the two lie on each other.
@@ -153,9 +149,7 @@ def test_axes_that_fit_alike_are_asked_for(shape, tmp_path):
         out.unlink()
 
 
-def test_particles_that_are_far_are_told_and_of_another_object_an_error(
-    store, true_parts, tmp_path
-):
+def test_particles_that_are_far_are_told_or_an_error(store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 900, 0.45)
     np.save(tmp_path / "p.npy", positions + 3.0)
     words = (tmp_path / "p.npy", "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply")

@@ -46,9 +46,7 @@ BAD_FIELDS: dict[str, Change] = {
     "one voxel": lambda f: {"voxels": np.zeros_like(f.voxels)},
     "not occupied": lambda f: {"occupancy": np.zeros_like(f.occupancy)},
     "another grid": lambda f: {"occupancy": np.ones((32, 32, 32), bool)},
-    "empty": lambda f: {
-        name: getattr(f, name)[:0] for name in ("voxels", "material", "properties")
-    },
+    "empty": lambda f: {k: getattr(f, k)[:0] for k in ("voxels", "material", "properties")},
     "no files": lambda f: {"sources": ()},
     "warnings of objects": lambda f: {"warnings": (object(),)},
     "bounds of objects": lambda f: {"bounds": {"a": object()}},
@@ -120,18 +118,15 @@ def test_whatever_is_raised_is_theirs(make_pair, error):
             ask()
 
 
-@pytest.mark.parametrize(
-    "held",
-    [
-        None,
-        Holding(properties=(1, 2)),  # type: ignore[arg-type]
-        Holding(properties=()),
-        Holding(properties=(PROPERTIES[0],) * 2),
-        Holding(classes="abc"),  # type: ignore[arg-type]
-        Holding(classes=("A\x1b[2J",)),
-        Holding(classes=tuple(f"c{k}" for k in range(255))),
-    ],
-)
+@pytest.mark.parametrize("held", [
+    None,
+    Holding(properties=(1, 2)),  # type: ignore[arg-type]
+    Holding(properties=()),
+    Holding(properties=(PROPERTIES[0],) * 2),
+    Holding(classes="abc"),  # type: ignore[arg-type]
+    Holding(classes=("A\x1b[2J",)),
+    Holding(classes=tuple(f"c{k}" for k in range(255))),
+])  # fmt: skip
 def test_what_a_source_cannot_hold_is_refused(held):
     with pytest.raises(InputError, match=THEIRS):
         source(describe=lambda _: held).describe(None)

@@ -103,9 +103,8 @@ def test_several_samples_by_number(find):
 def test_each_sample_with_each_view(find):
     files = [f"a/sample_{k}/material_grid.npy" for k in (0, 1)]
     pairs = find(files, ["a/left.npz", "a/right.npz"], pixieverse={"samples": "all"})
-    assert [pair.asset_id for pair in pairs] == [
-        f"a.{view}.sample_{k}" for view in ("left", "right") for k in (0, 1)
-    ]
+    names = [f"a.{view}.sample_{k}" for view in ("left", "right") for k in (0, 1)]
+    assert [pair.asset_id for pair in pairs] == names
     assert {pair.view for pair in pairs} == {"left", "right"}
     assert all(not pair.problem for pair in pairs)
 
@@ -316,19 +315,16 @@ def test_ids_in_a_map_cannot_leave_the_folder(find, tmp_path):
     assert pairs[1].slat is None
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("id,other\na,b\n", "expected object_id and slat_id"),
-        ("", "columns none"),
-        ("object_id,slat_id\na,\n", "line 2: empty"),
-        ("object_id,slat_id\n\x80", "cannot be read"),
-        ("object_id,slat_id,object_id\na,b,c\n", "has two columns"),
-        ("object_id,slat_id,view,view\na,b,c,d\n", "has two columns"),
-        ("object_id;slat_id\na;1\n", "save it with commas between the columns"),
-        ("\xff\xfeo\0b\0", "save it as CSV in UTF-8"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("id,other\na,b\n", "expected object_id and slat_id"),
+    ("", "columns none"),
+    ("object_id,slat_id\na,\n", "line 2: empty"),
+    ("object_id,slat_id\n\x80", "cannot be read"),
+    ("object_id,slat_id,object_id\na,b,c\n", "has two columns"),
+    ("object_id,slat_id,view,view\na,b,c,d\n", "has two columns"),
+    ("object_id;slat_id\na;1\n", "save it with commas between the columns"),
+    ("\xff\xfeo\0b\0", "save it as CSV in UTF-8"),
+])  # fmt: skip
 def test_bad_maps(find, tmp_path, text, message):
     table = tmp_path / "map.csv"
     table.write_bytes(text.encode("latin-1"))
@@ -347,11 +343,10 @@ def test_a_pipe_in_place_of_a_table_is_not_waited_for(find, tmp_path, key):
 
 
 def test_a_list_of_categories_beyond_reason_is_not_read(find, tmp_path):
-    table = tmp_path / "huge.json"
-    with table.open("wb") as file:
-        file.truncate(2**40)  # a hole: it takes no space on disk
+    (tmp_path / "huge.json").touch()
+    os.truncate(tmp_path / "huge.json", 2**40)  # a hole: it takes no space on disk
     with pytest.raises(ConfigError, match="larger than 256 MiB"):
-        find([grid("a")], ["a.npz"], categories=table)
+        find([grid("a")], ["a.npz"], categories=tmp_path / "huge.json")
 
 
 def test_categories(find, tmp_path):

@@ -27,10 +27,9 @@ def prediction_of(grid: np.ndarray, *, scores: bool) -> np.ndarray:
     prediction = np.full((11 if scores else 4, 64, 64, 64), -1.0, dtype=np.float32)
     occupied = grid[..., 3] != 7
     values = grid[occupied].astype(np.float64)
-    for channel, (column, (lo, hi)) in enumerate(
-        [(np.log10(values[:, 0]), LOG_DENSITY), (np.log10(values[:, 1]), LOG_E), (values[:, 2], NU)]
-    ):
-        prediction[channel, occupied] = 2 * (column - lo) / (hi - lo) - 1
+    columns = np.log10(values[:, 0]), np.log10(values[:, 1]), values[:, 2]
+    for channel, (lo, hi) in enumerate((LOG_DENSITY, LOG_E, NU)):
+        prediction[channel, occupied] = 2 * (columns[channel] - lo) / (hi - lo) - 1
     if scores:
         for k in range(8):
             prediction[3 + k] = grid[..., 3] == k
@@ -79,9 +78,8 @@ def test_prediction_beyond_its_range_is_clipped_and_counted(make_pair):
     beyond = ((0, 1, 2, 3), 1.5), ((1, 1, 2, 3), -3.0), (np.s_[2, :, 2, 3], 7.0)
     field = read_field(make_pair(grid=changed(SCORES, *beyond)))
 
-    np.testing.assert_allclose(
-        field.properties[0], [10 ** LOG_E[0], 10 ** LOG_DENSITY[1], NU[1]], rtol=2e-6
-    )
+    ends = [10 ** LOG_E[0], 10 ** LOG_DENSITY[1], NU[1]]
+    np.testing.assert_allclose(field.properties[0], ends, rtol=2e-6)
     # The metal voxel of the raw grid is stiffer and denser, the other's ratio higher.
     clipped = [warning for warning in field.warnings if "clipped" in warning]
     assert [int(warning.split()[1]) for warning in clipped] == [2, 2, 2]

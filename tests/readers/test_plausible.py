@@ -113,9 +113,8 @@ def test_a_unit_is_named_and_what_states_it_mends_it(read, unit):
     parts = [UNITS[unit](*part) for part in RIGHT]
     with pytest.raises(InputError, match=f"look like .*{re.escape(unit)}") as error:
         read(*parts)
-    stated = {
-        ("youngs_modulus" if one.endswith("Pa") else "density"): one for one in unit.split(" and ")
-    }
+    names = {True: "youngs_modulus", False: "density"}
+    stated = {names[one.endswith("Pa")]: one for one in unit.split(" and ")}
     for name, one in stated.items():
         assert f'{name} = "{one}"' in str(error.value) or unit not in str(error.value).split("(")[0]
     field = read(*parts, units=Units(**stated))
@@ -207,15 +206,12 @@ def made_once() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("made_once")
-@pytest.mark.parametrize(
-    ("assets", "seed", "options"),
-    [
-        *((3, 3, {"source": source}) for source in get_args(Source)),
-        # Of seed 77, a soft and light part of the first is called metal by mistake.
-        (4, 77, {"levels": (0,), "samples": 4}),
-        (3, 5, {"levels": (5, 6, 7)}),
-    ],
-)
+@pytest.mark.parametrize(("assets", "seed", "options"), [
+    *((3, 3, {"source": source}) for source in get_args(Source)),
+    # Of seed 77, a soft and light part of the first is called metal by mistake.
+    (4, 77, {"levels": (0,), "samples": 4}),
+    (3, 5, {"levels": (5, 6, 7)}),
+])  # fmt: skip
 def test_no_demo_data_look_like_a_mistake(tmp_path, assets, seed, options):
     make_demo(tmp_path / "demo", assets, seed, **options)
     pairs = discover(load_parameters(tmp_path / "demo" / "dataset.toml"))

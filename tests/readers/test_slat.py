@@ -250,17 +250,14 @@ def test_trellis_2_has_the_moments_that_microsoft_publishes(tmp_path):
         assert f"{folder}{{id}}.npz" in slat_patterns(source)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("{}", "channels"),
-        ('{"encoder": "a", "channels": 2, "resolution": 64, "mean": [1]}', "each of 2 channels"),
-        ('{"encoder": "a", "channels": 1, "resolution": 64, "mean": [1], "std": [0]}', "above 0"),
-        ('{"encoder": "a", "channels": 2, "resolution": 1}', r"mine\.json.*resolution"),
-        ('{"encoder": "a", "channels": 2, "resolution": 257}', r"mine\.json.*resolution"),
-        ("nonsense", "cannot|Expecting|describes"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ("{}", "channels"),
+    ('{"encoder": "a", "channels": 2, "resolution": 64, "mean": [1]}', "each of 2 channels"),
+    ('{"encoder": "a", "channels": 1, "resolution": 64, "mean": [1], "std": [0]}', "above 0"),
+    ('{"encoder": "a", "channels": 2, "resolution": 1}', r"mine\.json.*resolution"),
+    ('{"encoder": "a", "channels": 2, "resolution": 257}', r"mine\.json.*resolution"),
+    ("nonsense", "cannot|Expecting|describes"),
+])  # fmt: skip
 def test_a_file_that_describes_no_encoder(tmp_path, text, said):
     path = tmp_path / "mine.json"
     path.write_text(text)

@@ -15,14 +15,7 @@ from support.made_store import edit_json
 from support.raw_sources import field_at
 from support.trees import records_beside
 
-from slatprep.demo.sources import (
-    ONE_FRAME,
-    write_description,
-    write_physxnet,
-    write_points,
-    write_vomp,
-    write_voxels,
-)
+from slatprep.demo import sources
 from slatprep.errors import ConfigError, InputError
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.inspect.verify import verify_store
@@ -69,22 +62,22 @@ def in_order(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write_description(tmp_path / "voxels", TABLE, CLASSES)
+    sources.write_description(tmp_path / "voxels", TABLE, CLASSES)
     return tmp_path / "voxels"
 
 
-@pytest.mark.parametrize("form", ["npz", "hdf5", "zarr", "ply", *ONE_FRAME])
+@pytest.mark.parametrize("form", ["npz", "hdf5", "zarr", "ply", *sources.ONE_FRAME])
 def test_every_form_holds_the_same_72_000_voxels(root, form):
     rows = rows_of(72_000)
     if form == "ply":
         del rows["segment"]  # Its vertices have no column of another length.
     if form == "vomp":
-        write_vomp(root, "a", rows["voxels"], rows)
+        sources.write_vomp(root, "a", rows["voxels"], rows)
     elif form == "physxnet":
-        write_physxnet(root, "a", rows["voxels"], rows["density"])
+        sources.write_physxnet(root, "a", rows["voxels"], rows["density"])
     else:
-        write_voxels(root, "a", form, rows)
-    adapter = form if form in ONE_FRAME else "voxels"
+        sources.write_voxels(root, "a", form, rows)
+    adapter = form if form in sources.ONE_FRAME else "voxels"
     field, expected = field_at(root, adapter), in_order(rows)
     np.testing.assert_array_equal(field.voxels, expected["voxels"])
     assert [one.name for one in field.table] == COLUMNS[adapter]
@@ -102,43 +95,43 @@ def test_every_form_holds_the_same_72_000_voxels(root, form):
 
 
 def test_a_grid_of_128_may_be_fuller_than_all_of_64(root):
-    write_description(root, TABLE, CLASSES, resolution=128)
+    sources.write_description(root, TABLE, CLASSES, resolution=128)
     rows = rows_of(300_000, side=128)
-    write_voxels(root, "a", "npz", rows)
+    sources.write_voxels(root, "a", "npz", rows)
     np.testing.assert_array_equal(field_at(root).voxels, np.unique(rows["voxels"] // 2, axis=0))
 
 
 def test_a_voxel_that_is_given_twice_is_refused_where_the_rows_differ(root):
     rows = {name: column[:80] for name, column in rows_of(80).items()}
     again = {name: np.concatenate([column, column[:1]]) for name, column in rows.items()}
-    write_voxels(root, "a", "npz", again)
+    sources.write_voxels(root, "a", "npz", again)
     assert len(field_at(root).voxels) == 80
     for name, other in (("density", 5000.0), ("material", 2 - rows["material"][0] % 2)):
         changed = again | {name: again[name].copy()}
         changed[name][-1] = other
-        write_voxels(root, "a", "npz", changed)
+        sources.write_voxels(root, "a", "npz", changed)
         with pytest.raises(InputError, match=r"rows 0 and 80 are of one voxel, and differ"):
             field_at(root)
     # Of points a cell may hold several.
     points = changed | {"voxels": ((changed["voxels"] + 0.5) / 64 - 0.5).astype(np.float32)}
-    write_voxels(root, "a", "npz", points)
+    sources.write_voxels(root, "a", "npz", points)
     assert len(field_at(root).voxels) == 80
 
 
 def test_a_resolution_that_is_not_the_voxels_own_is_told(root):
-    write_description(root, TABLE, CLASSES, resolution=128)
+    sources.write_description(root, TABLE, CLASSES, resolution=128)
     for side, tells in ((64, 1), (128, 0)):
-        write_voxels(root, "a", "npz", rows_of(300, side))
+        sources.write_voxels(root, "a", "npz", rows_of(300, side))
         told = [text for text in field_at(root).warnings if "plausibility of places" in text]
         assert len(told) == tells
-    write_voxels(root, "a", "npz", rows_of(300))
+    sources.write_voxels(root, "a", "npz", rows_of(300))
     (told, *_) = field_at(root).warnings
     assert "as on a grid of 64^3, and 128^3 is read" in told and "source.json" in told
 
 
 def test_rows_and_voxels_of_physxnet_belong_together(tmp_path):
     rows, root = rows_of(500), tmp_path / "physx"
-    write_physxnet(root, "a", rows["voxels"], rows["density"])
+    sources.write_physxnet(root, "a", rows["voxels"], rows["density"])
     np.save(root / "property" / "a2.npy", np.ones((499, 14)))
     with pytest.raises(InputError, match=r"has 499 rows; expected 500, a row a vertex of a\.ply"):
         field_at(root, "physxnet")
@@ -150,24 +143,20 @@ def test_rows_and_voxels_of_physxnet_belong_together(tmp_path):
         field_at(root, "physxnet")
 
 
-@pytest.mark.parametrize(
-    ("classes", "said"),
-    [
-        (["wood", "wood"], "there are 2 classes"),
-        ([], "there are 0 classes"),
-        ([f"c{k}" for k in range(255)], "there are 255 classes"),
-        (["background"], "the names of classes are background"),
-        (["Wood"], "the names of classes are Wood"),
-        (None, "the key 'aligned' occurs twice"),
-    ],
-)
+@pytest.mark.parametrize(("classes", "said"), [
+    (["wood", "wood"], "there are 2 classes"),
+    ([], "there are 0 classes"),
+    ([f"c{k}" for k in range(255)], "there are 255 classes"),
+    (["background"], "the names of classes are background"),
+    (["Wood"], "the names of classes are Wood"),
+    (["wood"], "the key 'aligned' occurs twice"),
+])  # fmt: skip
 def test_descriptions_that_no_store_can_follow_are_refused(root, classes, said):
-    if classes is not None:
-        edit_json(root / "source.json", lambda about: about.update(classes=classes))
-    else:
+    edit_json(root / "source.json", lambda about: about.update(classes=classes))
+    if "twice" in said:
         twice = '{"aligned": true, "aligned": false, '
         (root / "source.json").write_text((root / "source.json").read_text().replace("{", twice, 1))
-    write_voxels(root, "a", "npz", rows_of(10))
+    sources.write_voxels(root, "a", "npz", rows_of(10))
     with pytest.raises(ConfigError, match=said):
         field_at(root)
 
@@ -176,7 +165,7 @@ def test_a_class_that_the_table_does_not_have_is_refused(root):
     for material in (3, -1, 0.5):
         rows = rows_of(10)
         rows["material"] = np.full(10, material, np.float32)
-        write_voxels(root, "a", "npz", rows)
+        sources.write_voxels(root, "a", "npz", rows)
         with pytest.raises(InputError, match=r"has classes that are none; expected 10 of 0\.\.2"):
             field_at(root)
 
@@ -206,7 +195,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("how", DAMAGES)
 def test_zarr_that_cannot_be_read_is_said(root, how):
-    write_voxels(root, "a", "zarr", rows_of(3000))
+    sources.write_voxels(root, "a", "zarr", rows_of(3000))
     damage, said = DAMAGES[how]
     damage(root / "a.zarr" / "density")
     with pytest.raises(InputError, match=rf"a\.zarr \[density\].*({said})"):
@@ -216,7 +205,7 @@ def test_zarr_that_cannot_be_read_is_said(root, how):
 @pytest.mark.parametrize("name", ["voxels", "material", "density", "damping"])
 def test_a_lost_chunk_of_zarr_is_refused_unless_it_may_be_empty(root, name):
     rows = rows_of(3000) | {"material": np.zeros(3000, np.uint8)}
-    write_voxels(root, "a", "zarr", rows)
+    sources.write_voxels(root, "a", "zarr", rows)
     assert len(field_at(root).voxels) == 3000
     chunk = next(file for file in (root / "a.zarr" / name / "c").rglob("*") if file.is_file())
     chunk.unlink()
@@ -231,13 +220,13 @@ def test_a_lost_chunk_of_zarr_is_refused_unless_it_may_be_empty(root, name):
 
 def test_any_file_of_a_zarr_group_decides_what_it_is_and_no_system_does(root, monkeypatch):
     rows = rows_of(100)
-    write_voxels(root, "a", "zarr", rows)
+    sources.write_voxels(root, "a", "zarr", rows)
     before = field_at(root).sources[0]
     with monkeypatch.context() as elsewhere:
         elsewhere.setattr("zipfile.sys.platform", "win32")
         assert field_at(root).sources[0] == before
     chunk = next((root / "a.zarr" / "damping" / "c").rglob("0"))
-    write_voxels(root, "b", "zarr", rows | {"damping": rows["damping"][::-1]})
+    sources.write_voxels(root, "b", "zarr", rows | {"damping": rows["damping"][::-1]})
     shutil.copy(next((root / "b.zarr" / "damping" / "c").rglob("0")), chunk)
     shutil.rmtree(root / "b.zarr")
     assert field_at(root).sources[0].sha256 != before.sha256
@@ -258,7 +247,7 @@ def test_a_zarr_group_that_cannot_be_listed_is_its_own_fault_alone(root, name, m
 def test_a_ply_that_claims_more_than_it_has_is_refused(root):
     columns = {axis: np.zeros(3, np.float32) for axis in "xyz"}
     rest = {"density": np.ones(3, np.float32), "damping": np.ones(3, np.float32)}
-    write_points(root / "a.ply", columns | rest)
+    sources.write_points(root / "a.ply", columns | rest)
     with pytest.raises(InputError, match="has no property 'material'"):
         field_at(root)
     text = (root / "a.ply").read_bytes().replace(b"vertex 3", b"vertex 99999999999")
@@ -356,13 +345,13 @@ def test_changed_voxels_of_a_zarr_group_are_looked_up_anew(root):
     box = np.argwhere(np.ones((20, 14, 9))) + 22
     rows = {"voxels": box, "density": np.full(len(box), 500.0), "damping": np.full(len(box), 0.5)}
     rows["material"] = (box[:, 0] > 30).astype(np.uint8)
-    write_description(root, TABLE, CLASSES, aligned=True)
-    write_voxels(root, "a", "zarr", rows)
+    sources.write_description(root, TABLE, CLASSES, aligned=True)
+    sources.write_voxels(root, "a", "zarr", rows)
     of = _, store = known_build(root, "voxels", box.astype(np.uint8))
     first = build_store(*of)
     assert build_store(*of).build_id == first.build_id
     assert not verify_store(store, sources=True).findings
-    write_voxels(root, "a", "zarr", rows | {"density": np.full(len(box), 600.0)})
+    sources.write_voxels(root, "a", "zarr", rows | {"density": np.full(len(box), 600.0)})
     (finding,) = verify_store(store, sources=True).findings
     assert "bytes" in finding.what
     assert build_store(*of).build_id != first.build_id

@@ -48,10 +48,7 @@ def kill_self() -> None:
 
 
 def environment(folder: Path, fault: str = "") -> dict[str, str]:
-    """Return the environment of a process, and of its workers, with a fault, if any.
-
-    The fault is the body of ``def reached(step, name)``; a module for it is written to the folder.
-    """
+    """Return the environment of a process with a fault, the body of ``def reached(step, name)``."""
     folder.mkdir(exist_ok=True)
     here = str(Path(__file__).parents[1])
     paths = (str(folder), here, os.environ.get("PYTHONPATH", ""))

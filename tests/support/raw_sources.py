@@ -14,10 +14,8 @@ FEATS = np.arange(24, dtype=np.float32).reshape(3, 8) / 8 - 1
 
 
 def raw_grid() -> np.ndarray:
-    """Return three voxels of jelly, metal and stationary in a grid of background.
-
-    Channels are in the files' order: density, Young's modulus, Poisson's ratio, class.
-    """
+    """Return three voxels of jelly, metal and stationary in a grid of background."""
+    # In the files' order: density, Young's modulus, Poisson's ratio, class.
     grid = np.zeros((64, 64, 64, 4), dtype=np.float32)
     grid[..., 3] = 7
     grid[1, 2, 3] = 1000.0, 2.0e6, 0.25, 0

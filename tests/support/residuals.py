@@ -21,10 +21,7 @@ def distance_at(surface: Surface, points: Array) -> Array:
 
 
 def carried(slat: Surface, pixie: Surface, pose: Similarity, affine: Array) -> tuple[Array, Array]:
-    """Return where the SLAT's samples are looked up, and where the PixieVerse ones are.
-
-    The `affine` (3, 4) map is applied to the SLAT's side before the pose.
-    """
+    """Return where both sides' samples are looked up; `affine` (3, 4) is the SLAT's, first."""
     matrix, shift = affine[:, :3], affine[:, 3]
     there = (slat.points @ matrix.T + shift - pose.shift) @ pose.rotation / pose.scale
     placed = pose.scale * pixie.points @ pose.rotation.T + pose.shift
@@ -44,10 +41,8 @@ def residuals(
 def within_box(surface: Surface, points: Array) -> NDArray[np.bool_]:
     """Say which points have a signed distance of their own."""
     index = points - surface.origin
-    inside: NDArray[np.bool_] = ((index > 0) & (index < np.array(surface.distance.shape) - 1)).all(
-        axis=1
-    )
-    return inside
+    inside = (index > 0) & (index < np.array(surface.distance.shape) - 1)
+    return np.asarray(inside.all(axis=1))
 
 
 def mean_kernel(residual: Array) -> float:

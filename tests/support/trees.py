@@ -30,12 +30,10 @@ def inodes(directory: Path) -> dict[str, int]:
 
 
 def contents(s3: Any, place: str) -> dict[str, str]:
-    """Return the hash of every object below a place, by its name relative to that.
-
-    The server's word will do: the ETag of what came in one part is the hash of what lies there.
-    """
+    """Return the hash of every object below a place, by its name relative to that."""
     base = place.removeprefix("s3://").rstrip("/") + "/"
     found = s3.find(base, detail=True)
+    # The ETag of what came in one part is the hash of what lies there.
     tags = {name: about["ETag"].strip('"') for name, about in found.items()}
     return {
         name.removeprefix(base): digest(s3.cat_file(name)) if "-" in tag else tag

@@ -89,11 +89,8 @@ def hold_whole(picture: np.ndarray, *columns: int) -> None:
 
 def test_several_assets_get_a_file_each_and_a_contact_sheet(copy, tmp_path, monkeypatch):
     read: list[str] = []
-    scenes = scene_of
-    monkeypatch.setattr(
-        "slatprep.inspect.pictures.write.scene_of",
-        lambda asset: read.append(asset.asset_id) or scenes(asset),
-    )
+    noted = "slatprep.inspect.pictures.write.scene_of"
+    monkeypatch.setattr(noted, lambda asset: read.append(asset.asset_id) or scene_of(asset))
     folder, again = tmp_path / "pictures", tmp_path / "again"
     words = ("--worst", "1", "--asset", "cup", "--store", copy, "--picture")
     told = json.loads(run(*words, folder, "--json").stdout)["assets"]
@@ -311,9 +308,8 @@ def test_numbers_stand_beside_their_thresholds(copy):
 
 
 @pytest.mark.usefixtures("sides")
-def test_without_a_screen_show_says_where_the_picture_is_also_of_a_broken_store(
-    copy, tmp_path, monkeypatch
-):
+def test_without_a_screen_show_says_where_the_picture_is(copy, tmp_path, monkeypatch):
+    """Also of a broken store."""
     if sys.platform != "linux":
         pytest.skip("a screen is always taken to be there")
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -64,19 +64,13 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
     for flag in (
-        "--headless=new",
-        "--no-sandbox",  # which root has to do without
-        "--disable-dev-shm-usage",
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--no-first-run",
-        "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader",
-        "--force-prefers-reduced-motion",
-        "--window-size=1400,1000",
-        f"--user-data-dir={tmp_path_factory.mktemp('chromium')}",
-    ):
-        options.add_argument(flag)
+        "headless=new", "no-sandbox",  # which root has to do without
+        "disable-dev-shm-usage", "disable-background-networking", "disable-component-update",
+        "no-first-run", "use-angle=swiftshader", "enable-unsafe-swiftshader",
+        "force-prefers-reduced-motion", "window-size=1400,1000",
+        f"user-data-dir={tmp_path_factory.mktemp('chromium')}",
+    ):  # fmt: skip
+        options.add_argument(f"--{flag}")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(chromedriver))
     try:
@@ -118,6 +112,13 @@ def click(browser: Chrome, selector: str) -> None:
     browser.execute_script("document.querySelector(arguments[0]).click()", selector)
 
 
+def choose(browser: Chrome, menu: str, value: str) -> None:
+    """Choose an entry of a menu."""
+    script = """const menu = document.getElementById(arguments[0]); menu.value = arguments[1];
+        menu.dispatchEvent(new Event('change'))"""
+    browser.execute_script(script, menu, value)
+
+
 def assert_quiet(browser: Chrome) -> None:
     """Nothing went wrong, nothing was fetched, and no data was run."""
     assert browser.get_log("browser") == []
@@ -151,13 +152,9 @@ def test_it_opens_sorts_and_filters(opened):
     search.send_keys("onerror=")
     assert set(rows(opened)) == {"ant", "cup", "torn"}
     search.send_keys(Keys.CONTROL, "a", Keys.NULL, Keys.BACKSPACE)
-    choose = (
-        "const s = document.getElementById('category'); s.value = '=' + arguments[0];"
-        "s.dispatchEvent(new Event('change'))"
-    )
-    opened.execute_script(choose, HOSTILE)
+    choose(opened, "category", f"={HOSTILE}")
     assert rows(opened) == ["cup"]
-    opened.execute_script(choose.replace("'=' + arguments[0]", "'*'"))
+    choose(opened, "category", "*")
     click(opened, "[data-key=confidence] .bin")
     assert 0 < len(rows(opened)) < 7
     click(opened, "#applied .chip")
@@ -245,14 +242,10 @@ def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
     click(browser, "[data-sort=model]")
     assert rows(browser) == ["long", "bent"]
     click(browser, "[data-sort=confidence]")
-    least = browser.execute_script(
-        "return ASSETS.confidence.indexOf(Math.min(...ASSETS.confidence))"
-    )
+    confidences = browser.execute_script("return ASSETS.confidence")
+    least = confidences.index(min(confidences))
     assert rows(browser)[0] == browser.execute_script("return ASSETS.id[arguments[0]]", least)
-    browser.execute_script(
-        "const s = document.getElementById('model'); s.value = '=deformable';"
-        "s.dispatchEvent(new Event('change'))"
-    )
+    choose(browser, "model", "=deformable")
     assert rows(browser) == ["bent"]
     click(browser, "tbody tr:not(.space)")
     pixels = drawn(browser)
@@ -355,9 +348,8 @@ def test_assets_say_how_many_annotations_agree(merged, browser, tmp_path):
     assert assets["annotations"] == [[2, 2], [2, 3], None]
     assert assets["votes"] == [1.0, 1.0, None]
     modulus = open_store(report.store).normalization.ranges[0]
-    expected = [
-        np.std(np.log10(FACTORS[name][:2])) * 2 / (modulus.hi - modulus.lo) for name in "ab"
-    ]
+    spreads = [np.std(np.log10(FACTORS[name][:2])) for name in "ab"]
+    expected = np.multiply(spreads, 2 / (modulus.hi - modulus.lo))
     np.testing.assert_allclose([one[0] for one in assets["spreads"][:2]], expected, atol=1e-4)
     assert assets["spreads"][2] is None
 
@@ -420,9 +412,8 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Report:
     np.savez(root / "voxels/strange.npz", **{IN_NAMES: np.zeros(1)})
     dataset.write_slat("strange.npz", dataset.assets["ant"].coords, dataset.assets["ant"].feats)
     described = [{"name": name, "unit": unit, "scale": "log10"} for name, unit in units.items()]
-    (root / "voxels/source.json").write_text(
-        json.dumps({"properties": described, "classes": False})
-    )
+    about = {"properties": described, "classes": False}
+    (root / "voxels/source.json").write_text(json.dumps(about))
     kinds = (HOSTILE, "__proto__", f"{HOSTILE}\u2028`${{window.broken = 1}}")
     categories = {name: {"obj_class": kind} for name, kind in zip(SOUND, kinds, strict=True)}
     (root / "categories.json").write_text(json.dumps(categories))

@@ -20,7 +20,7 @@ from support.pages import HOSTILE, Page
 from support.synthetic import QUARTER_TURN
 
 from slatprep.errors import StoreError
-from slatprep.geometry.frames import apply_transform, voxel_centres
+from slatprep.geometry.frames import apply_transform, make_transform, voxel_centres
 from slatprep.inspect import report
 from slatprep.inspect.overview import overview_of
 from slatprep.inspect.report import write_report
@@ -114,11 +114,8 @@ def test_class_balance_is_by_category(page, hostile):
     group = zarr.open_group(hostile.store, mode="r")
     offsets, material = group["asset/offset"][:], group["voxel/material"][:]
     rows = {row["category"]: row for row in page.content["balance"]}
-    assert {name: row["assets"] for name, row in rows.items()} == {
-        "animal": 3,
-        HOSTILE: 1,
-        "vessel": 1,
-    }
+    counts = {name: row["assets"] for name, row in rows.items()}
+    assert counts == {"animal": 3, HOSTILE: 1, "vessel": 1}
     animals = material[: offsets[3]]
     expected = [int((animals == kind).sum()) for kind in range(7)]
     assert rows["animal"]["classes"] == [*expected, int((animals == 255).sum())]
@@ -134,14 +131,12 @@ def test_voxels_of_the_view_are_the_store_s(page, hostile, index):
     seen = unpack(page, index)
     np.testing.assert_array_equal(seen["slat"], asset.coords[order])
     np.testing.assert_array_equal(seen["columns"][0], asset.material[order])
-    for k in range(3):
-        shown = seen["columns"][1 + k] / 63 * 2 - 1
-        assert np.abs(shown - asset.properties[order, k]).max() <= 1 / 63 + 1e-6
+    shown = seen["columns"][1:4].T / 63 * 2 - 1
+    assert np.abs(shown - asset.properties[order]).max() <= 1 / 63 + 1e-6
     # The boundary is that of the field, which the transform lays on the SLAT exactly.
-    moved = (seen["field"] + 0.5) / 64 - 0.5
-    moved = moved @ asset.transform[:3, :3].T + asset.transform[:3, 3]
+    moved = apply_transform(asset.transform, voxel_centres(seen["field"]))
     moved = np.rint((moved + 0.5) * 64 - 0.5).astype(int)
-    assert {tuple(v) for v in moved.tolist()} == {tuple(v) for v in seen["slat"].tolist()}
+    np.testing.assert_array_equal(np.unique(moved, axis=0), seen["slat"])
 
 
 def test_a_deformed_boundary_lies_on_the_slat(deformed_build, tmp_path):
@@ -191,9 +186,8 @@ def test_a_store_too_large_is_shown_in_part_and_coarsely(hostile, tmp_path, monk
     np.testing.assert_array_equal(unpack(page, 2)["slat"], np.unique(dog.coords // 2, axis=0))
 
 
-def test_of_a_store_too_large_to_list_a_sample_is_listed_and_all_are_counted(
-    hostile, page, tmp_path, monkeypatch
-):
+def test_of_a_store_too_large_to_list_a_sample_is_listed(hostile, page, tmp_path, monkeypatch):
+    """And all are counted."""
     monkeypatch.setattr(report, "ASSETS_IN_DETAIL", 3)
     monkeypatch.setattr(report, "ASSETS_LISTED", 4)
     store = open_store(hostile.store)
@@ -215,15 +209,13 @@ def test_of_a_store_too_large_to_list_a_sample_is_listed_and_all_are_counted(
     assert clips[0] == clips[1]
 
 
-@pytest.mark.parametrize(("angle", "expected"), [(0.0, 0.0), (10.0, 10.0), (44.0, 44.0)])
-def test_nearest_quarter_turn(angle, expected):
-    transform = QUARTER_TURN.copy()
-    tilt = Rotation.from_rotvec([np.radians(angle), 0, 0]).as_matrix()
-    transform[:3, :3] = 0.8 * tilt @ QUARTER_TURN[:3, :3]
-    index, found = nearest_quarter_turn(transform)
-    assert quarter_turns()[index] == "x→+y y→\u2212x z→+z"
-    assert found == pytest.approx(expected, abs=1e-4)
+def test_nearest_quarter_turn():
     assert len(set(quarter_turns())) == 24
+    for angle in (0.0, 10.0, 44.0):
+        tilt = Rotation.from_rotvec([np.radians(angle), 0, 0]).as_matrix()
+        index, found = nearest_quarter_turn(make_transform(tilt, scale=0.8) @ QUARTER_TURN)
+        assert quarter_turns()[index] == "x→+y y→\u2212x z→+z"
+        assert found == pytest.approx(angle, abs=1e-4)
 
 
 # -- a page that is safe and whole --------------------------------------------
@@ -252,10 +244,9 @@ def test_nothing_is_fetched_and_no_other_script_may_run(page):
 
 
 def test_the_bytes_do_not_depend_on_the_jobs(hostile, tmp_path):
-    write_report(
-        open_store(hostile.store), tmp_path / "two.html", manifests=hostile.manifests, jobs=2
-    )
-    assert (tmp_path / "two.html").read_bytes() == hostile.path.read_bytes()
+    two = tmp_path / "two.html"
+    write_report(open_store(hostile.store), two, manifests=hostile.manifests, jobs=2)
+    assert two.read_bytes() == hostile.path.read_bytes()
 
 
 # -- records ------------------------------------------------------------------
@@ -283,10 +274,7 @@ def test_other_records_are_refused(hostile, tmp_path):
 
 
 def test_numbers_that_all_reasons_of_a_kind_share_are_kept():
-    reasons = [
-        "only 76.1% lie within 1 voxel (good: 80%)",
-        "only 9% lie within 1 voxel (good: 80%)",
-    ]
+    reasons = [f"only {share}% lie within 1 voxel (good: 80%)" for share in (76.1, 9)]
     kinds = kinds_of([*reasons, "a/b.npz: holds 3 rows; expected 2"])
     assert [kinds[reason] for reason in reasons] == ["only N% lie within 1 voxel (good: 80%)"] * 2
     assert kinds["a/b.npz: holds 3 rows; expected 2"] == "holds 3 rows"

@@ -64,13 +64,10 @@ SHARDS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "byte", "what"),
-    [
-        *((name, 20, "chunk 0 is damaged") for name in SHARDS),
-        *((name, -6, "no sound index") for name in SHARDS[::3]),
-    ],
-)
+@pytest.mark.parametrize(("name", "byte", "what"), [
+    *((name, 20, "chunk 0 is damaged") for name in SHARDS),
+    *((name, -6, "no sound index") for name in SHARDS[::3]),
+])  # fmt: skip
 def test_a_flipped_bit_names_the_file_and_the_assets(store, name, byte, what):
     flip(store / name, byte, 3)
     findings = of_file(found(store), name)
@@ -78,26 +75,18 @@ def test_a_flipped_bit_names_the_file_and_the_assets(store, name, byte, what):
     assert any(finding.asset and what in finding.what for finding in findings)
 
 
-def test_truncated_shards_are_found(store):
-    sizes = {name: (store / name).stat().st_size for name in SHARDS}
-    for name in SHARDS:
-        os.truncate(store / name, sizes[name] - 7)
+@pytest.mark.parametrize(
+    ("names", "cut"),
+    [(SHARDS, 7), ([*SHARDS, "asset/fitness/c/0"], 0), (["asset/id/c/0", "asset/zarr.json"], 0)],
+)
+def test_files_that_were_cut_short_or_deleted_are_found(store, names, cut):
+    sizes = {name: (store / name).stat().st_size for name in names}
+    for name in names:
+        os.truncate(store / name, sizes[name] - cut) if cut else (store / name).unlink()
     all_found = found(store)
     for name, size in sizes.items():
-        said = [finding.what for finding in of_file(all_found, name)]
-        assert f"was cut short: it has {size - 7} of {size} bytes" in said
-
-
-@pytest.mark.parametrize(
-    "names", [[*SHARDS, "asset/fitness/c/0"], ["asset/id/c/0", "asset/zarr.json"]]
-)
-def test_deleted_files_are_found(store, names):
-    for name in names:
-        (store / name).unlink()
-    all_found = found(store)
-    for name in names:
-        findings = of_file(all_found, name)
-        assert any(finding.what.startswith("is missing") for finding in findings), name
+        told = f"was cut short: it has {size - cut} of {size} bytes" if cut else "is missing"
+        assert any(one.what.startswith(told) for one in of_file(all_found, name)), name
 
 
 def test_swapped_shards_extra_files_and_links_are_named_as_such(store, tmp_path):
@@ -111,14 +100,11 @@ def test_swapped_shards_extra_files_and_links_are_named_as_such(store, tmp_path)
     linked.rename(tmp_path / "elsewhere")
     linked.symlink_to(tmp_path / "elsewhere")
     told = {finding.file: finding.what for finding in found(store)}
-    sizes = first.stat().st_size, second.stat().st_size
-    if sizes[0] == sizes[1]:
-        assert told["voxel/feats/c/0/0"] == "holds what belongs in voxel/feats/c/1/0"
-    swapped = dict.fromkeys(("voxel/feats/c/0/0", "voxel/feats/c/1/0"))
-    assert told | swapped == swapped | {
-        "voxel/feats/c/99": "belongs to no array",
-        "voxel/distance/c/1": "is a link",
-    }
+    of_first, _ = (told.pop(f"voxel/feats/c/{k}/0") for k in (0, 1))
+    if first.stat().st_size == second.stat().st_size:
+        assert of_first == "holds what belongs in voxel/feats/c/1/0"
+    others = {"voxel/feats/c/99": "belongs to no array", "voxel/distance/c/1": "is a link"}
+    assert told == others
 
 
 OUT_OF_THE_CONTRACT: list[list[tuple[str, Any, object, str]]] = [
@@ -197,9 +183,8 @@ def test_another_confidence_of_a_voxel_is_found_and_told_of_as_of_other_code(sto
     findings = of_file(found(store), "voxel/confidence")
     for finding, asset in zip(findings, changed, strict=True):
         assert asset.valid[7] and abs(asset.confidence[7] - 0.5) > 0.1
-        assert (finding.asset, finding.what) == (
-            asset.asset_id, f"1 of {len(asset.coords)} voxels differ",
-        )  # fmt: skip
+        told = f"1 of {len(asset.coords)} voxels differ"
+        assert (finding.asset, finding.what) == (asset.asset_id, told)
         other = "by today's code; another made the store" in finding.expected
         assert other is (asset.asset_id == "dog")
 
@@ -230,15 +215,12 @@ def test_a_coordinate_beyond_the_grid_is_refused_wherever_an_asset_is_read(store
         assert "a coordinate above 63" in refused(*words, code=1)
 
 
-@pytest.mark.parametrize(
-    ("edit", "what"),
-    [
-        (lambda d: d["attributes"].update(resolution=32), "attribute resolution is 32"),
-        (lambda d: d["attributes"].update(manifest="0" * 64), "the attributes changed"),
-        (lambda d: d["attributes"]["normalization"]["density"].update(lo=99), "normalization"),
-        (lambda d: d.pop("consolidated_metadata"), "has no consolidated metadata"),
-    ],
-)
+@pytest.mark.parametrize(("edit", "what"), [
+    (lambda d: d["attributes"].update(resolution=32), "attribute resolution is 32"),
+    (lambda d: d["attributes"].update(manifest="0" * 64), "the attributes changed"),
+    (lambda d: d["attributes"]["normalization"]["density"].update(lo=99), "normalization"),
+    (lambda d: d.pop("consolidated_metadata"), "has no consolidated metadata"),
+])  # fmt: skip
 def test_edited_root_metadata_are_found(store, edit, what):
     edit_json(store / "zarr.json", edit)
     assert any(what in finding.what for finding in of_file(found(store), "zarr.json"))
@@ -318,9 +300,9 @@ def test_edited_manifests_are_found(store):
     lines = records.read_text().splitlines()
     records.write_text("\n".join(line.replace('"cup"', '"cop"') for line in lines) + "\n")
     findings = of_file(found(store), str(records))
-    assert [(one.asset, one.what) for one in findings] == [
-        ("cup", f"line {open_store(store).ids.index('cup') + 1} differs from asset/record")
-    ]
+    line = open_store(store).ids.index("cup") + 1
+    told = [("cup", f"line {line} differs from asset/record")]
+    assert [(one.asset, one.what) for one in findings] == told
 
 
 OF_THE_STORE: list[tuple[str, object]] = [
