@@ -38,14 +38,30 @@ SHARE = 0.01
 
 @dataclass(eq=False)
 class Before:
-    """What is there before a build of these pairs to a place.
+    """What is there before a build.
 
-    The files of `previous`, the store that is there, have been read once it is checked. It was
-    `built` if a build is known to have made it, and not a choice among another's assets. Its files
-    and records are `as_left` by the last build, or else `damaged` is what is not as it was written.
-    `known` has state and key of the assets whose sources are as the last build saw them. `seed`
-    drew those that were hashed all the same; None if none was. `unnoticed` are ids of assets whose
-    sources are other ones, though their states are as they were.
+    Attributes
+    ----------
+    place : Destination
+        Where the store lies, and its records.
+    pairs : sequence of AssetPair
+        The dataset.
+    wanted : Wanted
+        What the build is asked for.
+    previous : SourceStore or None
+        The store that is there. Its files have been read once it is checked.
+    known : mapping of str to (bytes, str)
+        State and key of the assets whose sources are as the last build saw them.
+    built : bool
+        Whether a build is known to have made the store, and not a choice among another's assets.
+    as_left : bool
+        Whether the files of store and records are as the last build left them.
+    damaged : tuple of str
+        What of the store is not as it was written.
+    unnoticed : tuple of str
+        Ids of assets whose sources are other ones, though their states are as they were.
+    seed : int or None
+        What the assets were drawn with whose sources were hashed all the same; None if none was.
     """
 
     place: Destination

@@ -88,11 +88,22 @@ class Action(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlannedAsset:
-    """What will be done with one asset, and the reason in one line.
+    """What will be done with one asset.
 
-    `key` is empty where the sources cannot be read. `names` are those that its record has
-    otherwise, such as its category or the paths of its files. `seen` is the state of its sources as
-    they were hashed, empty where nobody looked.
+    Attributes
+    ----------
+    asset_id : str
+        Id of the row.
+    action : Action
+        What is done.
+    reason : str
+        Why, in one line.
+    key : str
+        See `slatprep.pipeline.recipe`; empty where the sources cannot be read.
+    names : mapping of str to object, or None
+        Those that its record has otherwise, such as its category or the paths of its files.
+    seen : bytes
+        State of its sources as they were hashed; empty where nobody looked.
     """
 
     asset_id: str

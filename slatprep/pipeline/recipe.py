@@ -91,10 +91,20 @@ def recipe_of(parameters: BuildParameters) -> Recipe:
 class Wanted:
     """What a build is asked for.
 
-    `recipe` decides an asset's row, and `build`, the attribute of that name, the store's bytes
-    besides. `ranges` do not depend on the dataset, or say where those of the dataset come from.
-    `declared` is what the sources hold. With `compact`, rows are by id, whatever the order of the
-    existing store.
+    Attributes
+    ----------
+    parameters : BuildParameters
+        Sources and methods.
+    recipe : Recipe
+        What decides an asset's row.
+    build : mapping
+        What decides the store's bytes besides, as its attribute ``build`` says it.
+    ranges : Normalization or str
+        Ranges that do not depend on the dataset, or where those of the dataset come from.
+    declared : Contents
+        What the sources hold.
+    compact : bool
+        Rows by id, whatever the order of the existing store.
     """
 
     parameters: BuildParameters

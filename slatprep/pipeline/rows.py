@@ -143,12 +143,28 @@ Names = Mapping[str, Any]
 class Row:
     """An asset that goes into a store, and where its arrays lie.
 
-    In the spool, `key` names its file, and `columns` has what its record says in ``asset/*`` by
-    last name. There are also ``n_valid``; ``n_placements``, its distinct placements that fit about
-    as well; ``odd``, what is unusual of its sources by kind; ``grid``, the digest of its grid.
-    Otherwise it is a `row` of one of the stores that rows are taken from, and `names` are those
-    that its record there has otherwise. `damaged` says why what an older store holds of it was not
-    taken over. `seen` is the state of its sources as they were read, empty where they were not.
+    Attributes
+    ----------
+    asset_id : str
+        Id of the row.
+    n_voxels : int
+        Its SLAT voxels.
+    key : str
+        Names its file in the spool.
+    columns : mapping of str to object
+        What its record says in ``asset/*`` by last name, of a row in the spool; ``n_valid`` and
+        ``n_placements``, its distinct placements that fit about as well, ``odd``, what is unusual
+        of its sources by kind, and ``grid``, the digest of its grid, too.
+    store : int
+        Which of the stores that rows are taken from has it; `IN_SPOOL` where none.
+    row : int
+        Its row there.
+    names : mapping of str to object, or None
+        Those that its record there has otherwise.
+    damaged : str
+        Why, in words, what an older store holds of it was not taken over.
+    seen : bytes
+        State of its sources as they were read; empty where they were not.
     """
 
     asset_id: str
@@ -189,9 +205,23 @@ def moments_of(rows: Sequence[Row], stores: Sequence[SourceStore]) -> list[Laten
 class NextStore:
     """A store that is to be written.
 
-    It has `rows` in their order, some of them taken from `stores`, and ranges, contents, the
-    attribute `build`, and sizes of chunks and shards. It `replaces` the one store that rows are
-    taken from, if the two may have files in common.
+    Attributes
+    ----------
+    rows : sequence of Row
+        Its assets, in its order.
+    stores : tuple of SourceStore
+        Those that rows are taken from.
+    normalization : Normalization
+        The ranges of its properties.
+    contents : Contents
+        What it holds.
+    build : mapping
+        Its attribute ``build``.
+    parameters : StoreParameters
+        Sizes of its chunks and shards.
+    replaces : bool
+        Whether it takes the place of the one store that rows are taken from, so that the two
+        may have files in common.
     """
 
     rows: Sequence[Row]

@@ -33,10 +33,20 @@ GROUPS = ("voxel", "grid", "record")
 class Shard:
     """One shard of every array of a group: a single task's work.
 
-    It has the rows `start` to ``stop - 1`` of the store, and `pieces` say which of them an older
-    store has in whole chunks. `first` is the index of the first asset that has rows in it. `rows`
-    say where the arrays of each such asset lie, in a form that the writer knows. `offsets` are
-    their first rows in the store, and the last one's end.
+    Attributes
+    ----------
+    group : str
+        One of `GROUPS`.
+    start, stop : int
+        First row and end in the store.
+    first : int
+        Index of the first asset that has rows in it.
+    rows : sequence
+        Where the arrays of the assets lie that have rows in it, in a form that the writer knows.
+    offsets : sequence of int
+        First row of each of them in the store, and the last one's end.
+    pieces : sequence of Piece
+        Its rows, and which of them an older store has in whole chunks.
     """
 
     group: str
