@@ -44,11 +44,11 @@ VERTEX = np.dtype(
 UNITS = "density kg/m^3, E Pa, nu 1"
 """The units, a comment in every PLY written here."""
 
-_COMMENTS = {
+COMMENTS: dict[Frame, str] = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",
     "pixieverse": "frame PixieVerse, world coordinates of its bounds",
 }
-
+"""The frame, a comment in every PLY of an asset."""
 
 Bounds = NDArray[np.float64]
 """Smallest and largest world coordinates of a field, (2, 3)."""
@@ -83,7 +83,7 @@ def write(
     columns = zip(asset.store.contents.properties, there.values.T, strict=True)
     more = {(of.name, of.unit): own for of, own in columns if of.name not in PROPERTY_COLUMNS}
     solid, material = there.solid(asset), there.material
-    write_points(directory / name, positions, material, solid, conf, _COMMENTS[frame], more)
+    write_points(directory / name, positions, material, solid, conf, COMMENTS[frame], more)
     return Exported(asset, name, len(material))
 
 

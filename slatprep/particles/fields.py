@@ -15,7 +15,7 @@ from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import denormalize_properties
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
-from slatprep.readers.slat import check_coords
+from slatprep.readers.slat import COORDS, check_coords
 from slatprep.records import (
     BACKGROUND,
     MAX_LATENT_RESOLUTION,
@@ -29,7 +29,7 @@ from slatprep.store.records import StoredRecords
 Points = Literal["slat", "grid"]
 
 _SPECS = {
-    "coords": ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu"),
+    "coords": COORDS,
     "material": ArraySpec(shapes=((None,),), kinds="iu"),
 }
 _PROPERTIES = ArraySpec(shapes=((None, 3),), kinds="f")

@@ -145,7 +145,6 @@ def write_gaussians(path: Path, vertices: NDArray[Any], comment: str) -> None:
     write_ply(path, vertices.astype(layout), comment)
 
 
-_PAPER = 255.0
 _SUFFIXES = (".gif", ".png", ".webp")
 
 
@@ -182,7 +181,7 @@ def draw(
     shade = 1.0 - 0.35 * (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
     colours = colours_of(vertices) * 255 * shade[:, None]
     shown = 1 / (1 + np.exp(-np.asarray(vertices["opacity"], dtype=float))) > 0.3
-    image = np.full((height, width, 3), _PAPER)
+    image = np.full((height, width, 3), 255.0)
     front = np.argsort(depth, kind="stable")  # The nearest first.
     rank, least = np.argsort(front), np.full(height * width, len(front))
     reach = int(np.ceil(radius.max()))

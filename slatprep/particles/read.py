@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
+from slatprep.export import ply
 from slatprep.readers.files import ArraySpec, npy_array, npz_arrays
 from slatprep.readers.points import ply_points
 from slatprep.storage.files import open_regular
@@ -28,7 +29,7 @@ TRELLIS saves Gaussians as (x, -z, y) (``Gaussian.save_ply``), and meshes as
 """
 
 FRAMES: dict[Axes, str] = {
-    "slat": "frame SLAT, unit cube -0.5..0.5, z up",
+    "slat": ply.COMMENTS["slat"],
     "trellis": "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y down",
     "glb": "frame TRELLIS as it saves meshes, unit cube -0.5..0.5, y up",
 }
@@ -94,7 +95,7 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     if faults:
         where = [float(column[min(faults)]) for column in columns]
         raise InputError(path, f"particle {min(faults)} lies at {where}", "finite x, y, z")
-    if axes is None and any(comment.startswith("frame PixieVerse") for comment in comments):
+    if axes is None and ply.COMMENTS["pixieverse"] in comments:
         raise InputError(
             path,
             "is an export of points in the PixieVerse frame",

@@ -83,8 +83,8 @@ def discover(
     pixieverse, slat, pairing = parameters.pixieverse, parameters.slat, parameters.pairing
     sources = (pixieverse, *parameters.also)
     for root in (*(source.root for source in sources), slat.root):
-        if str(root) != in_unicode(str(root)):
-            raise ConfigError(f"{root}: is no UTF-8, so that no record can hold it; rename it")
+        if fault := _unrecordable(str(root)):
+            raise ConfigError(fault)
     try:
         for source in sources:
             if not source.root.is_dir() and not is_archive(source.root.name):

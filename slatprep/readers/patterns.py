@@ -25,6 +25,9 @@ file systems allow."""
 ASSET_ID = re.compile(rf"{NAME.pattern}(\.[A-Za-z0-9._-]{{1,255}})?")
 """What the id of a row may be: an id, or one and a view."""
 
+LOOKED_AT = 20
+"""Folders that are looked into for a hint."""
+
 _VARIABLE = re.compile(r"(\{[^{}]*\}|\*)")
 
 

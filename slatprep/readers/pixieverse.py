@@ -205,8 +205,10 @@ def _contradictions(
     other, unless `plausibility` lets that pass.
     """
     classified = material != BACKGROUND
-    left_out = 1 - float(mask[classified].mean())
-    empty = 1 - float(classified[mask].mean())
+    both, whole, masked = (
+        int(np.count_nonzero(one)) for one in (mask & classified, classified, mask)
+    )
+    left_out, empty = 1 - both / whole, 1 - both / masked
     if plausibility == "off" or max(left_out, empty) <= _DIFFERS:
         return []
     fault = (

@@ -13,7 +13,7 @@ from dataclasses import replace
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import source_adapter
-from slatprep.readers.patterns import fill, held_names
+from slatprep.readers.patterns import LOOKED_AT, fill, held_names
 from slatprep.records import AssetPair, Place
 from slatprep.storage.archives import is_archive, shown
 from slatprep.storage.members import ArchivePlace, ArchiveTree, fetch
@@ -23,9 +23,6 @@ GRIDS, ARCHIVES = "render_outputs", "archives"
 
 _EVERY_S = 10.0
 """How often it is told how far reading is."""
-
-_LOOKED_AT = 20
-"""Folders that are looked into for a hint."""
 
 OTHERS = {
     "data": "rendered views",
@@ -117,7 +114,7 @@ def hint_of(source: PixieverseSource) -> str:
         if known := sorted(OTHERS.keys() & {*folders}):
             return f"it holds Pixie's {', '.join(known)}, and no {GRIDS}, which has the grids"
         inner = [place / name for name in sorted(folders)]
-        for _ in range(_LOOKED_AT):
+        for _ in range(LOOKED_AT):
             if not inner:
                 break
             below = replace(source, root=inner.pop(0))

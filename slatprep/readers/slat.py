@@ -45,7 +45,8 @@ def _textures_of(shapes: Place) -> Place:
     return textures / found[0]
 
 
-_COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
+COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
+"""Coordinates, or these behind a batch column."""
 
 _LARGEST = 1e4
 """No known encoder gives latents so large: theirs have a spread of some units."""
@@ -85,7 +86,7 @@ def read_slat(
         If the file cannot be used; the message names file, value and row.
     """
     feats = ArraySpec(((None, space.channels),), "f", note=f" (slat.encoder: {space.encoder})")
-    specs = {"coords": _COORDS, "feats": feats}
+    specs = {"coords": COORDS, "feats": feats}
     if texture := texture_of(path, space):
         return _with_texture(path, texture, root, space)
     if group:

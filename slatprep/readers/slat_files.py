@@ -10,16 +10,13 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers.adapters import latent_adapter
 from slatprep.readers.hdf5 import SUFFIXES, find_groups
-from slatprep.readers.patterns import find_files, held_names, list_below, tried_names
+from slatprep.readers.patterns import LOOKED_AT, find_files, held_names, list_below, tried_names
 from slatprep.records import Place
 from slatprep.records.encoders import LATENTS
 from slatprep.storage.archives import is_archive
 from slatprep.storage.place import storage_of
 
 _UNPACKED = "and SLATs are read unpacked: `tar -xf ARCHIVE -C FOLDER`, then point at FOLDER"
-
-_LOOKED_AT = 20
-"""Folders that are looked into for a hint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +110,7 @@ def _hint(source: SlatSource) -> str:
     """Say in which folder below the root SLATs lie, or what it holds; empty if neither is known."""
     try:
         files, folders = storage_of(source.root).names()
-        for name in sorted(folders)[:_LOOKED_AT]:
+        for name in sorted(folders)[:LOOKED_AT]:
             below = replace(source, root=source.root / name)
             if any(_each_slat(below, False)):
                 return f"; SLATs lie in {below.root}: point at that"
