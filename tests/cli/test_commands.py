@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -189,7 +190,8 @@ def test_stopped_build_leaves_the_older_store_and_nothing_else(demo, tmp_path):
         time.sleep(0.05)
     build.terminate()
     _, said = build.communicate(timeout=600)
-    assert build.returncode == 130, said
+    # Where it was importing a module, Python ends by the signal, which a shell calls 130, too.
+    assert build.returncode in (130, -signal.SIGINT), said
     assert "stopped; nothing was replaced" in said and "Traceback" not in said
     assert list(tmp_path.iterdir()) == [store]
     assert tree(store) == before
