@@ -15,12 +15,11 @@ from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import NextStore, moments_of
 from slatprep.readers.contents import in_words, look_standardised, pooled_moments
 from slatprep.readers.joins import explain_unmatched
-from slatprep.readers.plausible import ENOUGH, ODD, oddities_in
+from slatprep.readers.plausible import ENOUGH
 from slatprep.readers.values import guess_in
 from slatprep.records import AssetPair, Normalization, Verdict
 from slatprep.store import Store
 from slatprep.store.record import FailedRecord
-from slatprep.store.records import StoredRecords
 
 # What the range would be without an asset: narrower by decades, or by its own widths.
 _WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0
@@ -60,8 +59,8 @@ def dataset_notices(
     yield from latent_warnings(new, parameters.slat.standardised)
     if not (parameters.consensus.settle or parameters.pixieverse.samples == "merge"):
         yield from shared_rotation(new)
-    made = {row.asset_id: row.columns["odd"] for row in new.rows if row.spooled}
-    yield from unusual_sources(made, len(made), failed)
+    made = {row.asset_id: str(row.columns["unusual"]) for row in new.rows if row.spooled}
+    yield from unusual_sources(made, failed)
     yield from shared_sources(new)
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
         yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
@@ -81,36 +80,32 @@ def much_clipped(store: Store) -> Iterator[str]:
             )
 
 
-def unusual_sources(
-    odd: Mapping[str, Mapping[str, str]], among: int, failed: Sequence[FailedRecord] = ()
-) -> Iterator[str]:
-    """Yield once what is unusual, `odd`, of sources of assets, and what refused values look like.
+def unusual_sources(told: Mapping[str, str], failed: Sequence[FailedRecord] = ()) -> Iterator[str]:
+    """Yield once of each kind what is unusual, by asset, and what refused values look like.
 
-    The records tell of each.
+    `told` has ``asset/unusual`` of all assets by id. The records tell of each.
     """
-    for kind in sorted({kind for own in odd.values() for kind in own}):
-        told = [(asset_id, own[kind]) for asset_id, own in odd.items() if kind in own]
+    odd: dict[str, dict[str, str]] = defaultdict(dict)
+    for asset_id, lines in told.items():
+        for kind, _, text in (line.partition(": ") for line in lines.split("\n") if line):
+            odd[kind][asset_id] = text
+    for kind, texts in sorted(odd.items()):
         also = ""
         if kind == "values":
             refused = Counter(guess for one in failed if (guess := guess_in(one.reason)))
             for unit, count in refused.most_common(1):
-                these = "these" if told[1:] else "this"
+                these = "these" if len(texts) > 1 else "this"
                 also = f"; {count} refused assets look like {unit}, and {these} probably too"
+        first = next(iter(texts.values()))
         yield (
-            f"{kind} of {len(told):,} of {among:,} assets are unusual "
-            f"({_first([name for name, _ in told])}): {told[0][1]}{also}"
+            f"{kind} of {len(texts):,} of {len(told):,} assets are unusual "
+            f"({_first(list(texts))}): {first}{also}"
         )
 
 
 def stored_oddities(store: Store) -> list[str]:
-    """Say what is unusual of the sources of all assets of a store, by their records."""
-    records, odd = StoredRecords(store), {}
-    for row, asset_id in enumerate(store.ids):
-        # A record takes a hundred times as long to check as to search.
-        text = records.text(row)
-        if ODD in text[text.rfind('"warnings":') :]:
-            odd[asset_id] = oddities_in(records.read(row).warnings)
-    return list(unusual_sources(odd, len(store)))
+    """Say what is unusual of the sources of all assets of a store."""
+    return list(unusual_sources(dict(zip(store.ids, store.column("unusual"), strict=True))))
 
 
 def shared_rotation(new: NextStore) -> Iterator[str]:

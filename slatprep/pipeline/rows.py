@@ -153,8 +153,8 @@ class Row:
         Names its file in the spool.
     columns : mapping of str to object
         What its record says in ``asset/*`` by last name, of a row in the spool; ``n_valid`` and
-        ``n_placements``, its distinct placements that fit about as well, ``odd``, what is unusual
-        of its sources by kind, and ``grid``, the digest of its grid, too.
+        ``n_placements``, its distinct placements that fit about as well, and ``grid``, the digest
+        of its grid, too.
     store : int
         Which of the stores that rows are taken from has it; `IN_SPOOL` where none.
     row : int

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.normalize import property_extent
 from slatprep.pipeline.rows import Row
-from slatprep.readers.plausible import oddities_in
 from slatprep.records import (
     RESOLUTION,
     Annotation,
@@ -209,7 +208,6 @@ def row_of(record: AssetRecord, text: bytes, extent: NDArray[np.float64]) -> Row
         "clipped_grid": np.zeros(len(extent), np.int64),
         "n_valid": record.counts.valid,
         "n_placements": len(record.alignment.placements),
-        "odd": oddities_in(record.warnings),
         "grid": next((file.sha256 for file in record.sources if file.role == "grid"), ""),
     }
     return Row(record.asset_id, record.counts.slat_voxels, record.key, columns)

@@ -18,7 +18,6 @@ from slatprep.geometry.voxels import voxels_at
 from slatprep.parameters import PixieverseSource, SampleParameters
 from slatprep.readers import files
 from slatprep.readers.adapters import Holding, SourceAdapter
-from slatprep.readers.plausible import told_of
 from slatprep.readers.values import require_plausible, require_possible, require_prediction
 from slatprep.readers.voxel_sets import physical, physical_rows
 from slatprep.records import (
@@ -32,6 +31,7 @@ from slatprep.records import (
     Normalization,
     Place,
     SourceFile,
+    oddity,
 )
 
 _CUBE = (RESOLUTION,) * 3
@@ -218,7 +218,7 @@ def _contradictions(
         expected = "the mask of this grid, in the same axes, or none: mask = [] in [pixieverse]"
         raise InputError(path, fault, f'{expected}; or set plausibility = "warn" there')
     way = "is it of this grid, and in the same axes? mask = [] in [pixieverse] reads none"
-    return [told_of("masks", f"{path.name} {fault}: {way}")]
+    return [oddity("masks", f"{path.name} {fault}: {way}")]
 
 
 def _classes_of(

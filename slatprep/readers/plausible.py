@@ -1,21 +1,20 @@
 """What materials can have, who says so, and what people mistake.
 
 Mistakes are of units, columns, class ids and layouts. The one whose undoing makes implausible
-values plausible is likely the one that was made. Whatever is odd is told in warnings of one form.
+values plausible is likely the one that was made.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import permutations, product
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from slatprep.records import LOG10, PROPERTIES, Units, to_si
+from slatprep.records import LOG10, PROPERTIES, Units, oddity, to_si
 
 _EXTENTS = (
     # The softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry and
@@ -29,30 +28,8 @@ _EXTENTS = (
 )
 """Least and most that any material has of each of `PROPERTIES`."""
 
-ODD = "plausibility"
-"""The first word of each warning of something unusual."""
-
-TOLD = f"{ODD}: "
-"""What a warning about values begins with."""
-
-_ODD = re.compile(rf"{ODD}(?: of (\w+))?: (.+)", re.DOTALL)
-
 ENOUGH = 64
 """Voxels below which neither places nor moments say anything of their kind."""
-
-
-def told_of(what: str, text: str) -> str:
-    """Return a warning of the values, ``masks``, ``places`` or ``latents`` of an asset.
-
-    A build prints it, and what lists a store tells it again.
-    """
-    return f"{ODD} of {what}: {text}"
-
-
-def oddities_in(warnings: Iterable[str]) -> dict[str, str]:
-    """Return the first warning of each kind that `told_of` and `TOLD` tell of."""
-    found = [match for one in warnings if (match := _ODD.search(one))]
-    return {match[1] or "values": match[2] for match in reversed(found)}
 
 
 def low_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
@@ -61,7 +38,7 @@ def low_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
     if len(voxels) < ENOUGH or most >= side // 2:
         return []
     text = f"no coordinate is above {most}, as on a grid of {side // 2}^3, and {side}^3 is read"
-    return [told_of("places", f"{text}; {way}")]
+    return [oddity("places", f"{text}; {way}")]
 
 
 # Carbon is the stiffest for its weight: diamond has 3.5e8 Pa m^3/kg times its density, fibres have

@@ -14,8 +14,16 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.readers.contents import in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays, load_group
-from slatprep.readers.plausible import ENOUGH, low_places, told_of
-from slatprep.records import RESOLUTION, TRELLIS, LatentSpace, Place, SourceFile, StructuredLatents
+from slatprep.readers.plausible import ENOUGH, low_places
+from slatprep.records import (
+    RESOLUTION,
+    TRELLIS,
+    LatentSpace,
+    Place,
+    SourceFile,
+    StructuredLatents,
+    oddity,
+)
 from slatprep.storage.place import storage_of
 
 
@@ -212,5 +220,5 @@ def _check_feats(
         odd.append(f"channel {channels} of feats is the same in all rows")
     elif empty.mean() > _MANY_EMPTY:
         odd.append(f"feats are 0 in {empty.mean():.0%} of the rows")
-    warnings += [told_of("latents", f"{text}; encode the object again") for text in odd]
+    warnings += [oddity("latents", f"{text}; encode the object again") for text in odd]
     return latents

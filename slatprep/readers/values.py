@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.readers.plausible import (
-    TOLD,
     Part,
     beyond_all,
     fault_of,
@@ -32,6 +31,7 @@ from slatprep.records import (
     Property,
     SourceRoots,
     Units,
+    oddity,
     to_si,
 )
 
@@ -75,11 +75,11 @@ def require_plausible(
     faults = [(part, fault) for part in parts if (fault := fault_of(part, roots.units))]
     if not faults:
         odd = [(part, told) for part in parts if (told := oddity_of(part, roots.units))]
-        return [f"{TOLD}{_named(part)} has {told}" for part, told in odd]
+        return [oddity("values", f"{_named(part)} has {told}") for part, told in odd]
     share = sum(part.share for part, _ in faults)
     (part, fault), *_ = sorted(faults, key=lambda one: -one[0].share)
     if share < _SHARE:
-        return [f"{TOLD}{_named(part)} ({share:.0%} of the voxels) has {fault}"]
+        return [oddity("values", f"{_named(part)} ({share:.0%} of the voxels) has {fault}")]
     likely = mistakes_of(parts, roots.units)
     if not likely and not is_physical(part):
         return []  # The reader refuses it, and says which voxel.
@@ -91,7 +91,7 @@ def require_plausible(
         what = f"the values look like {guess}: {what}"
         advice = f"SI units, in the documented order; {likely[0].setting}"
     if roots.plausibility == "warn":
-        return [f'{TOLD}{what}; taken as they are (plausibility = "warn")']
+        return [oddity("values", f'{what}; taken as they are (plausibility = "warn")')]
     raise InputError(where, what, f'{advice}; or set plausibility = "warn" in [pixieverse]')
 
 
@@ -131,7 +131,7 @@ def require_prediction(
     if guesses:
         what = f"{what}; the values look like {guesses[0]}"
     if plausibility == "warn":
-        return [f'{TOLD}{what}; clipped (plausibility = "warn")']
+        return [oddity("values", f'{what}; clipped (plausibility = "warn")')]
     advice = "a grid in SI units, channels last (numpy.moveaxis(grid, 0, -1)), or a prediction"
     setting = '. plausibility = "warn" clips them' if plausibility else ""
     raise InputError(where, what, advice + setting)

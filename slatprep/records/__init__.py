@@ -47,6 +47,8 @@ from slatprep.records.sources import (
     SourceRoots,
     StructuredLatents,
     Units,
+    oddities_in,
+    oddity,
     to_si,
 )
 from slatprep.records.tables import (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -255,6 +256,23 @@ class MaterialField:
     table: tuple[Property, ...] = PROPERTIES
     frame: NDArray[np.float64] | None = None
     classified: bool = True
+
+
+_ODDITY = re.compile(r"unusual (values|masks|places|latents): (.+)", re.DOTALL)
+
+
+def oddity(kind: str, text: str) -> str:
+    """Return a warning of unusual ``values``, ``masks``, ``places`` or ``latents`` of a source.
+
+    A build prints it, and `slatprep info` and `slatprep list` tell it again.
+    """
+    return f"unusual {kind}: {text}"
+
+
+def oddities_in(warnings: Iterable[str]) -> dict[str, str]:
+    """Return the first text of each kind that `oddity` told, in one line, sorted by kind."""
+    found = [match for one in warnings if (match := _ODDITY.search(one))]
+    return dict(sorted({match[1]: " ".join(match[2].split()) for match in reversed(found)}.items()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,6 +123,8 @@ ARRAYS = (
         "share of right classes to be expected among valid voxels"),
     _asset("contradicted", "bool",
         "the latents contradict the labels, where latents were compared with them"),
+    _asset("unusual", "str",
+        "what is unusual of its values, masks, places or latents, a line each; else empty"),
     _kept("merged", "bool", "labels are merged of several annotations"),
     _kept("key", "uint8",
         "what decides the row, as one hash: sources, parameters, libraries and code", "byte"),

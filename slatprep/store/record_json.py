@@ -15,7 +15,7 @@ import numpy as np
 import orjson
 
 from slatprep.errors import StoreError
-from slatprep.records import SourceFile
+from slatprep.records import SourceFile, oddities_in
 from slatprep.storage.documents import read_as
 from slatprep.storage.place import is_place
 from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES
@@ -136,6 +136,7 @@ def columns_of(record: AssetRecord) -> dict[str, Any]:
         "ambiguity": judgement.ambiguity.material_share,
         "property_ambiguity": judgement.ambiguity.property_change,
         "valid_share": counts.valid / counts.slat_voxels,
+        "unusual": "\n".join(map(": ".join, oddities_in(record.warnings).items())),
         "merged": bool(record.merged),
         "key": np.frombuffer(bytes.fromhex(record.of_first_pass().key), np.uint8),
         "latent_mean": np.nan if moments is None else moments.mean,

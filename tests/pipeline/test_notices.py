@@ -62,7 +62,7 @@ def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
     summary = build_store(warn, tmp_path / "s.zarr")
     (text,) = [text for text in summary.warnings if "unusual" in text]
     assert text.startswith("values of 2 of 6 assets are unusual (a, b): the values look like")
-    assert sum("plausibility: " in line for line in summary.records.open()) == 2
+    assert sum("unusual values: " in line for line in summary.records.open()) == 2
 
 
 def test_unusual_values_are_told_with_what_refused_ones_look_like(dataset, tmp_path):

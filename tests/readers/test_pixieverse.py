@@ -117,7 +117,7 @@ def test_an_odd_grid_or_mask_is_read_as_far_as_it_goes_and_reported(make_pair, c
     assert field.occupancy.sum() == occupied
     if mask is not None:
         np.testing.assert_array_equal(field.occupancy, mask > 0.5)
-    others = ("clipped", "plausibility of masks: ")
+    others = ("clipped", "unusual masks: ")
     assert [one for one in field.warnings if not any(word in one for word in others)] == warnings
     assert any(others[1] in one for one in field.warnings) == any("the mask" in w for w in warnings)
 
@@ -132,7 +132,7 @@ def test_a_mask_that_contradicts_its_grid_is_told_or_refused(make_pair):
     grid, same = block(20, 20, 20), block(20, 20, 20)[..., 3] != 7
     assert read_field(make_pair(grid=grid, mask=same)).warnings == ()
     *_, told = read_field(make_pair(grid=grid, mask=np.roll(same, 3, axis=0))).warnings
-    assert told.startswith("plausibility of masks: mask.npy leaves out 30% of the voxels with a c")
+    assert told.startswith("unusual masks: mask.npy leaves out 30% of the voxels with a c")
     assert "30% of it is background" in told and "mask = []" in told
     other = make_pair(grid=grid, mask=np.roll(same, 7, axis=0))
     with pytest.raises(InputError, match=r"mask\.npy: leaves out 70% of .*mask = \[\]") as caught:
@@ -145,7 +145,7 @@ def test_a_mask_that_contradicts_its_grid_is_told_or_refused(make_pair):
         roots = replace(other.roots, plausibility=plausibility)
         field = read_field(replace(other, roots=roots))
         assert len(field.voxels) == 300
-        assert any("plausibility of masks" in text for text in field.warnings) == tells
+        assert any("unusual masks" in text for text in field.warnings) == tells
 
 
 def test_sources_are_named_and_hashed_and_bounds_are_ready_for_json(make_pair):

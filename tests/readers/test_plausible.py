@@ -76,7 +76,7 @@ def read(make_pair):
 
 
 def told(field: MaterialField) -> list[str]:
-    return [text for text in field.warnings if text.startswith("plausibility: ")]
+    return [text for text in field.warnings if text.startswith("unusual values: ")]
 
 
 @pytest.mark.parametrize("name", [*KNOWN, *PIXIE])

@@ -140,9 +140,7 @@ def cloud(side: int = 64, count: int = 200) -> dict[str, np.ndarray]:
 
 def test_coordinates_of_a_grid_of_half_the_side_are_told(make_pair):
     (told,) = read_latents(make_pair(**cloud(32))).warnings
-    assert told.startswith(
-        "plausibility of places: no coordinate is above 31, as on a grid of 32^3"
-    )
+    assert told.startswith("unusual places: no coordinate is above 31, as on a grid of 32^3")
     assert "slat.encoder" in told
     assert read_latents(make_pair(**cloud(64))).warnings == ()
     assert read_latents(make_pair(**cloud(32, count=20))).warnings == ()
@@ -159,7 +157,7 @@ def test_latents_that_no_encoder_gives_are_told(make_pair):
         (changed(feats, (np.s_[:30], 0)), "feats are 0 in 15% of the rows"),
     ):
         (told,) = read_latents(make_pair(**whole | {"feats": odd})).warnings
-        assert told.startswith(f"plausibility of latents: {said}")
+        assert told.startswith(f"unusual latents: {said}")
     assert read_latents(make_pair(**whole | {"feats": changed(feats, (3, 0))})).warnings == ()
 
 

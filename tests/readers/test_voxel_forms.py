@@ -122,7 +122,7 @@ def test_a_resolution_that_is_not_the_voxels_own_is_told(root):
     sources.write_description(root, TABLE, CLASSES, resolution=128)
     for side, tells in ((64, 1), (128, 0)):
         sources.write_voxels(root, "a", "npz", rows_of(300, side))
-        told = [text for text in field_at(root).warnings if "plausibility of places" in text]
+        told = [text for text in field_at(root).warnings if "unusual places" in text]
         assert len(told) == tells
     sources.write_voxels(root, "a", "npz", rows_of(300))
     (told, *_) = field_at(root).warnings
