@@ -130,6 +130,12 @@ def _target(store: Place, picture: Path | None, assets: int) -> Path | None:
         return None
     from slatprep.inspect.pictures.canvas import FORMATS
 
+    allowed = "", ".pictures", *(f".{kind}" for kind in FORMATS)
+    if picture.suffix.lower() not in allowed and not picture.is_dir():
+        raise click.UsageError(
+            f"--picture {picture}: expected a file that ends in .{', .'.join(FORMATS)}, a folder "
+            "without a suffix or with .pictures, or none"
+        )
     if assets > 1 and picture.suffix.lower()[1:] in FORMATS:
         raise click.UsageError(f"--picture {picture} is one file; {assets} assets need a folder")
     return picture
@@ -236,8 +242,8 @@ def score(output: Output, store: options.FolderOrUrl, truth_dir: options.Folder)
         )
 
     labels = ("label_accuracy", "similarity_accuracy", "truth_own", "valid_share")
-    for asset_id in report.missing:
-        output.problem(f"{truth_dir / asset_id}.npz: its asset is not in {store}")
+    missing = [f"{truth_dir / name}.npz: its asset is not in {store}" for name in report.missing]
+    output.problems(missing, "--json has all")
     output.result(report, show, complete=not report.missing)
 
 

@@ -94,8 +94,8 @@ def export(
         ply: point clouds with Pixie's fields. hdf5: one file. webdataset: tar shards. npz:
         TRELLIS's files and the targets. voxel_data: VoMP's npz. usd: for Newton and Isaac Lab.
     out : PATH
-        The file (hdf5) or folder (all others); an existing export is replaced when the new one is
-        complete.
+        The file (hdf5) or folder (all others); an existing export of the same format is replaced
+        when the new one is complete.
     assets
         An asset; may be repeated. [default: all]
     split

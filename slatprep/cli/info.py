@@ -94,7 +94,7 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
     if total.ambiguous:
         say(
             f"ambiguous: {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
-            f"well, and change more than {THRESHOLDS.good_ambiguity:.0%} of the classes"
+            f"well, and change the class of more than {THRESHOLDS.good_ambiguity:.0%} of the voxels"
         )
         say(f"look:    slatprep check-alignment --ambiguous --store {store}")
 
@@ -104,7 +104,7 @@ def show_errors(store: Store) -> None:
     from slatprep.pipeline.decoys import told_of
 
     for sentence in told_of(store):
-        say(f"errors:  {sentence}")
+        say(f"wrong pairs: {sentence}")
 
 
 def show_unusual(sentences: Iterable[str]) -> None:
@@ -177,7 +177,7 @@ def list_assets(
         rows = ((a.asset_id[:length], *attrgetter(*columns)(a), why(a.reasons)) for a in listed)
         title = f"{len(listed):,} of {len(opened):,} assets"
         output.table(title, ("id", *columns, "why"), rows)
-        if measured_errors(opened.path):
+        if listed and measured_errors(opened.path):
             show_errors(opened)
         show_unusual(unusual)
 

@@ -74,15 +74,15 @@ def export_store(
     store : Store, str or Place
         An open store, or its path or URL.
     out : str or Path
-        The file (``hdf5``) or folder (all others) to write. The new export replaces an old one
-        when complete; other files stay.
+        The file (``hdf5``) or folder (all others) to write. The new export replaces an old one of
+        the same format when complete; other files stay.
     format : {"ply", "hdf5", "webdataset", "npz", "voxel_data", "usd"}
         The format, see docs/export.md.
     assets : str, or sequence of str or int
         Ids, beginnings of ids, or numbers; empty takes all.
     verdicts : str or sequence of str, optional
-        Only assets with one of these verdicts; empty takes all. By default `assets` with any
-        verdict, or without them all good and doubtful assets.
+        Only assets with one of these verdicts; empty or ``all`` takes all. By default `assets`
+        with any verdict, or without them all good and doubtful assets.
     options : ExportOptions, optional
         Options of some formats.
     jobs : int
@@ -99,7 +99,7 @@ def export_store(
     ------
     ConfigError
         If no asset is left, an id is unknown, or `out` lies in a store or holds something
-        that is not an export.
+        that is not an export of this format.
     StoreError
         If the store cannot be read.
     """
@@ -121,7 +121,7 @@ def export_store(
                 tell(len(entries), len(ids))
             sizes = [file.stat().st_size]
     else:
-        with target.directory(out) as directory:
+        with target.directory(out, format) as directory:
             starts = range(0, len(ids), writer.batch)
             tasks = (
                 (writer.write, opened, directory, number, ids[start : start + writer.batch])

@@ -43,14 +43,20 @@ class Exported(NamedTuple):
     figures: Mapping[str, float] = MappingProxyType({})
 
 
+def verdicts_of(words: Sequence[str]) -> tuple[str, ...]:
+    """Return the verdicts that words name, none where all are; ConfigError for another word."""
+    words = words_of(words)
+    for one in sorted(words):
+        require_one_of("verdict", one, (*Verdict, "all"))
+    return () if "all" in words else tuple(words)
+
+
 def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str]) -> list[str]:
     """Return the sorted ids of `assets` with one of `verdicts`; an empty sequence takes all.
 
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
-    assets, verdicts = words_of(assets), words_of(verdicts)
-    for one in sorted(verdicts):
-        require_one_of("verdict", one, Verdict)
+    assets, verdicts = words_of(assets), verdicts_of(verdicts)
     rows = sorted({store.match(name) for name in assets}) or range(len(store))
     verdict = store.column("verdict")
     ids = (store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts)

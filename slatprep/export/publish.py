@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError, apart_from, printable
 from slatprep.export import croissant, export_store, target
 from slatprep.export.croissant import Stated
+from slatprep.export.formats import verdicts_of
 from slatprep.records import USABLE, Place, Verdict
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import storage_of
@@ -68,7 +69,7 @@ def publish_store(
     require_outside(out)
     assets = len(opened)
     chosen: Sequence[str] = ()
-    with target.directory(out) as folder:
+    with target.directory(out, "hub") as folder:
         if data == "store":
             where = opened.name
             _copy(opened, local, folder / where)
@@ -78,7 +79,7 @@ def publish_store(
             (folder / DESCRIPTION).write_text(croissant.to_json(document), encoding="utf-8")
         else:
             where = f"{SHARDS}/*.tar"
-            chosen = USABLE if verdicts is None else tuple(verdicts)
+            chosen = USABLE if verdicts is None else verdicts_of(verdicts)
             assets = export_store(
                 opened, folder / SHARDS, "webdataset", verdicts=chosen, progress=progress
             ).assets

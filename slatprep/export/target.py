@@ -31,16 +31,17 @@ _NEW, _RANDOM_LETTERS = "export", 8
 
 
 @contextmanager
-def directory(out: Path) -> Iterator[Path]:
+def directory(out: Path, kind: str) -> Iterator[Path]:
     """Yield a new empty folder that replaces `out` on success.
 
     If `out` holds other files beside an export, only the export's files are replaced, one by one.
-    ConfigError if `out` is neither empty nor an export, or another file has the name of a new one.
+    ConfigError if `out` is neither empty nor an export of the same kind, or another file has the
+    name of a new one.
     SlatprepError if it cannot be written.
     """
     # A link stays; its target is replaced.
     out = out.resolve()
-    own = _files_of_export(out) if out.exists() else frozenset()
+    own = _files_of_export(out, kind) if out.exists() else frozenset()
     if own is None:
         raise _not_an_export(out, "folder")
     with _writable(out):
@@ -113,8 +114,11 @@ def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, A
     (path / INDEX).write_bytes(head + b',\n  "assets": [\n    ' + rows + b"\n  ]\n}\n")
 
 
-def _files_of_export(out: Path) -> frozenset[str] | None:
-    """Return the names of an export's files and folders; None if `out` is not an export."""
+def _files_of_export(out: Path, kind: str) -> frozenset[str] | None:
+    """Return the names of an export's files and folders; None if `out` is not an export.
+
+    ConfigError if it is one of another kind, which is hardly meant to go.
+    """
     if not out.is_dir():
         return None
     if not any(out.iterdir()):
@@ -123,10 +127,16 @@ def _files_of_export(out: Path) -> frozenset[str] | None:
         index = json.loads((out / INDEX).read_text(encoding="utf-8"))
         if index["format"] != FORMAT:
             return None
+        there = index["kind"]
         names = [*index.get("files", ()), *(entry["file"] for entry in index["assets"])]
         files = [PurePosixPath(name) for name in names]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
+    if there != kind:
+        raise ConfigError(
+            f"{out} has an export in another format, {there}; expected one in {kind} to replace, "
+            "or a new path"
+        )
     folders = (str(parent) for file in files for parent in file.parents[:-1])
     return frozenset({INDEX, *map(str, files), *folders})
 

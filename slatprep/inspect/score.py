@@ -150,13 +150,17 @@ def score_against_truth(
 ) -> TruthReport:
     """Compare every asset of a store that has a truth in the folder with it.
 
-    InputError if there is no truth in the folder, or a truth does not fit its asset.
+    InputError if there is no truth in the folder, none of its truths is of an asset of the store,
+    or a truth does not fit its asset.
     """
     truths = {path.stem: path for path in sorted(truth_dir.glob("*.npz"))}
     if not truths:
         raise InputError(truth_dir, "no truth in it", "a folder with one <asset id>.npz an asset")
     opened = open_store(store)
     known = [asset_id for asset_id in opened.ids if asset_id in truths]
+    if not known:
+        fault = f"none of its {len(truths):,} files has the id of an asset of {store}"
+        raise InputError(truth_dir, fault, f"names such as {opened.ids[0]}.npz")
     scores = []
     for asset_id in known:
         scores.append(_score_asset(opened.asset(asset_id), truths[asset_id]))

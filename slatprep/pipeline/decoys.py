@@ -157,11 +157,10 @@ class MeasuredErrors:
             ]
         if not self.tells:
             return [
-                f"{amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')} are too "
-                f"few to tell how many show another object; it takes {LEAST_DECOYS} and "
-                f"{LEAST_TARGETS}",
                 f"likely at most {math.ceil(high):,} of the {self.good:,} called good show another "
-                f"object, and {shares[1]:.1%} of all assets",
+                f"object, and at most {shares[1]:.1%} of all assets",
+                f"{amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')} tell no "
+                f"more; {LEAST_DECOYS} decoys and {LEAST_TARGETS} assets tell how many it is about",
             ]
         return [
             f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "
@@ -396,8 +395,11 @@ def told_of(store: Store) -> list[str]:
     """Return what is known of a store's errors in sentences, or why nothing is known."""
     measured = measured_errors(store.path)
     if measured is None:
-        few = f"; decoys need {LEAST_TARGETS} assets" if len(store) < LEAST_TARGETS else ""
-        return [f"not measured{few or '; run `slatprep measure-errors`'}"]
+        if reason := _no_decoys(store):
+            return [f"not measured: {reason}"]
+        few = len(store) < LEAST_TARGETS
+        too = f", and so does a build of {LEAST_TARGETS} assets or more" if few else ""
+        return [f"not measured; `slatprep measure-errors` does it{too}"]
     told = measured.sentences()
     if measured.build != store.about.manifest:
         told.append(

@@ -73,6 +73,7 @@ def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tm
     ("info FOLDER", 1, "FOLDER is not a slatprep store"),
     ("check-alignment --asset cuo --store STORE", 2, "did you mean cup?"),
     ("check-alignment --store STORE", 2, "say which assets"),
+    ("check-alignment --asset cup --store STORE --picture NEW.jpg", 2, "ends in .png, .svg, .pdf"),
     ("report STORE --out s3://nowhere/p.html", 2, "expected a path of the local"),
     ("subset STORE --verdict good --out memory://s.zarr", 2, "gone when the command ends"),
     ("verify FOLDER", 1, "FOLDER is not a slatprep store"),

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from support.commands import run
+from support.commands import refused, run
 from support.exports import bytes_of, hold_truth, index_of
 from support.made_store import rewrite
 from support.synthetic import JELLY, METAL, QUARTER_TURN
@@ -152,6 +152,16 @@ def test_what_lies_beside_an_export_stays(format, store, tmp_path):
         assert (out / name).read_bytes() == content
 
 
+def test_an_export_in_another_format_is_not_replaced(store, tmp_path):
+    export_store(store, tmp_path / "out", "npz")
+    before = bytes_of(tmp_path / "out")
+    for words in ("export --format ply", "publish --data webdataset --pictures 0"):
+        command, *options = words.split()
+        said = refused(command, store, *options, "--out", tmp_path / "out")
+        assert "has an export in another format, npz" in said
+    assert bytes_of(tmp_path / "out") == before
+
+
 def test_a_file_of_another_origin_is_not_replaced(store, tmp_path):
     out = tmp_path / "export"
     export_store(store, out, "npz", assets=["cup"])
@@ -218,6 +228,7 @@ def test_assets_are_chosen_by_id_and_verdict(store, tmp_path):
         ({"assets": ["dog", "cup", "dog"], "verdicts": ["good"]}, ["cup", "dog"]),
         ({"assets": "bear.front"}, ["bear.front"]),  # A text is one asset, or one verdict.
         ({"verdicts": "good"}, open_store(store).ids),
+        ({"verdicts": "all"}, open_store(store).ids),  # As on the command line.
     ):
         export_store(store, tmp_path / "some", "npz", **arguments)
         assert [entry["asset_id"] for entry in index_of(tmp_path / "some")] == chosen
@@ -225,7 +236,7 @@ def test_assets_are_chosen_by_id_and_verdict(store, tmp_path):
         ({"assets": ["cuo"]}, r"did you mean cup\?"),
         ({"assets": "23"}, "no asset 23;"),
         ({"verdicts": ["failed"]}, r"no asset has the verdict failed; .* are 5 good"),
-        ({"verdicts": ["fine"]}, r"'fine'; expected one of good, doubtful, failed"),
+        ({"verdicts": ["fine"]}, r"'fine'; expected one of good, doubtful, failed, all"),
     ):
         with pytest.raises(ConfigError, match=said):
             export_store(store, tmp_path / "none", "npz", **arguments)
@@ -298,7 +309,7 @@ def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path):
     out = tmp_path / "o.npz"
     killed = (
         "import os, pathlib\nfrom slatprep.export.target import directory\n"
-        f"with directory(pathlib.Path({str(out)!r})) as new:\n"
+        f"with directory(pathlib.Path({str(out)!r}), 'ply') as new:\n"
         "    (new / 'half').write_text('done')\n    os.kill(os.getpid(), 9)\n"
     )
     for _ in range(2):
@@ -311,7 +322,7 @@ def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path):
     for folder in others:
         (folder / "mine").mkdir(parents=True)
     (tmp_path / ".o.npz.87654321").symlink_to(others[2])
-    with directory(out) as running, directory(out) as new:
+    with directory(out, "ply") as running, directory(out, "ply") as new:
         (new / "a").write_text("a")
         assert running.is_dir()  # Another export to the same place is left to end.
         (running / "b").write_text("b")

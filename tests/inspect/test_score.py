@@ -154,6 +154,10 @@ def test_a_printed_score_fits_a_terminal_and_tells_of_a_truth_without_a_row(stor
     assert [(one["level"], one["assets"]) for one in found["levels"]] == [(5, 1)]
     assert [one["asset_id"] for one in found["assets"]] == ["ant"]
     assert found["missing"] == ["nobody"]
+    (tmp_path / "truth" / "ant.npz").unlink()
+    told = run(*words, code=1)
+    assert told.stdout == "" and told.stderr.count("\n") == 1
+    assert "none of its 1 files has the id of an asset of" in told.stderr
 
 
 @pytest.mark.parametrize(("changes", "told"), [

@@ -58,9 +58,9 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
     others = tuple(replace(one, verdict="failed") for one in found.decoys)
     few = replace(found, decoys=others, good=4, good_wrong=0.1, good_wrong_range=(0.0, 0.3))
     assert few.sentences() == [
-        "3 decoys of 5 assets are too few to tell how many show another object; it takes 40 and 50",
         f"likely at most 1 of the 4 called good show another object, "
-        f"and {found.wrong_share_range[1]:.1%} of all assets",
+        f"and at most {found.wrong_share_range[1]:.1%} of all assets",
+        "3 decoys of 5 assets tell no more; 40 decoys and 50 assets tell how many it is about",
     ]
     enough = replace(few, refitted=True)
     assert "about 0 show another object (0 to 0; measured on 3 decoys" in enough.sentences()[0]
@@ -77,7 +77,10 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     assert set(found["errors"]) <= set(store.ids)
     assert (tmp_path / "errors.svg").read_text().startswith("<?xml")
     measured, asset_id = measured_errors(store.path), store.ids[0]
-    assert all(sentence in run("info", store.path).output for sentence in measured.sentences())
+    for command in ("info", "list"):
+        output = run(command, store.path).output
+        assert all(f"wrong pairs: {sentence}" in output for sentence in measured.sentences())
+    assert "wrong pairs" not in run("list", store.path, "--verdict", "failed").output
     words = ("check-alignment", "--asset", asset_id, "--store", store.path, "--picture", "none")
     assert "the probability of another object" not in run(*words).output
     assert "another_object" not in json.loads(run(*words, "--json").stdout)["assets"][0]
@@ -99,7 +102,9 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     assert told_of(store)[-1].startswith("measured before the last update, when there were 5")
     file.write_text("{")
     assert measured_errors(store.path) is None
-    assert told_of(store) == ["not measured; decoys need 50 assets"]
+    assert told_of(store) == [
+        "not measured; `slatprep measure-errors` does it, and so does a build of 50 assets or more"
+    ]
 
 
 OBJECTS = ("ant", "bear", "cup", "dog", "eel", "fox")
@@ -123,7 +128,7 @@ def test_a_build_measures_errors_the_same_for_any_number_of_jobs(make_dataset, t
     assert (manifests_of(one) / ERRORS).read_bytes() == (manifests_of(two) / ERRORS).read_bytes()
     assert tree(one) == tree(two) == tree(none)
     assert not (manifests_of(none) / ERRORS).exists()
-    assert told_of(open_store(none))[0].startswith("not measured; run")
+    assert told_of(open_store(none))[0].endswith("`slatprep measure-errors` does it")
 
 
 @pytest.mark.usefixtures("few_suffice")
