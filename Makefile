@@ -69,11 +69,12 @@ endif
 	echo "results: $(STORE) (the store), $(MANIFESTS) (a record of every asset)"; \
 	echo "look:    open data/$(NAME).html in a browser"; \
 	echo "next:    . $(BIN)/activate && slatprep info $(STORE)"; \
+	[ $$status -eq 0 ] || echo "failed:  something did not go in; the build's lines above and $(MANIFESTS) name it"; \
 	exit $$status
 
 $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(INSTALLED)
 	rm -rf $(DEMO)
-	$(BIN)/slatprep make-demo $(DEMO) --assets $(ASSETS) --seed $(SEED)
+	$(BIN)/slatprep make-demo $(DEMO) --assets $(ASSETS) --seed $(SEED) --quiet
 	@touch $@
 
 # -- development ------------------------------------------------------------

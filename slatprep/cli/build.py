@@ -103,7 +103,6 @@ def make_demo(
         title = f"Demo data in {summary.directory}"
         output.table(title, ("category", "objects"), sorted(summary.categories.items()))
         store = f"{summary.directory}.zarr"
-        # Also right where `make align` goes on by itself.
         output.note(f"a store of it: slatprep build-store --config {summary.config} --out {store}")
         output.note(f"its score:     slatprep score {store} {summary.directory / 'truth'}")
 
@@ -366,11 +365,6 @@ def subset(
     Rows, records and ranges are copied unchanged. Assets must have one of the verdicts and
     one of the categories; assets named by --asset are taken as well.
 
-    Parameters
-    ----------
-    assets
-        An asset; may be repeated.
-
     Example
     -------
     slatprep subset data/demo.zarr --verdict good --out good.zarr
@@ -381,9 +375,9 @@ def subset(
     from slatprep.inspect.overview import list_assets
     from slatprep.pipeline.join import subset_store
 
-    wanted = list(assets)
+    wanted, opened = list(assets), options.opened(store)
+    options.note_numbered(output, opened, assets)
     if chosen.verdicts or chosen.categories:
-        opened = options.opened(store)
         wanted += [asset.asset_id for asset in list_assets(opened, *chosen.of(opened))]
         if not wanted:
             there = tally(opened.column("verdict"))

@@ -50,8 +50,6 @@ def check_alignment(
 
     Parameters
     ----------
-    asset_ids
-        An asset; may be repeated.
     worst
         The N worst assets: failed ones first, then doubtful ones, each by confidence.
     ambiguous
@@ -77,6 +75,7 @@ def check_alignment(
     from slatprep.workers.local import run_in_order
 
     opened = options.opened(path)
+    options.note_numbered(output, opened, asset_ids)
     chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     target = _target(path, picture, len(chosen))
     tasks = ((opened.path, asset_id) for asset_id in chosen)

@@ -76,7 +76,7 @@ def export(
     *,
     kind: Annotated[Any, options.ChoiceOf("slatprep.export:FORMATS"), Click("--format")],
     out: options.NewFileOrFolder,
-    assets: options.AssetIds = (),
+    assets: options.AssetsOrAll = (),
     verdicts: options.UsableVerdicts = None,
     split: Annotated[Any, options.ChoiceOf("slatprep.readers.splits:SPLITS", "all")] = "all",
     splits: options.SplitOptions,
@@ -96,8 +96,6 @@ def export(
     out : PATH
         The file (hdf5) or folder (all others); an existing export of the same format is replaced
         when the new one is complete.
-    assets
-        An asset; may be repeated. [default: all]
     split
         Only objects of this split, as `slatprep train` splits them.
 
@@ -121,6 +119,7 @@ def export(
     if split != "all" and assets:
         raise ConfigError("--asset and --split both choose; give one of them")
     opened = options.opened(store)
+    options.note_numbered(output, opened, assets)
     if verdicts is None and not assets:
         options.note_left_out(output, opened)
         verdicts = USABLE

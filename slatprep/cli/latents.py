@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from slatprep.cli.options import AssetIds, File, FileOrUrl, NewFolder, Whole
+from slatprep.cli.options import AssetsOrAll, File, FileOrUrl, NewFolder, Whole
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import InputError
@@ -109,7 +109,7 @@ def decode_slat(
     source: FileOrUrl,
     *,
     out: NewFolder,
-    assets: AssetIds = (),
+    assets: AssetsOrAll = (),
     standardised: Standardised = "auto",
     model: ModelOptions,
 ) -> None:
@@ -123,8 +123,6 @@ def decode_slat(
     ----------
     out
         Folder of the Gaussians; files of other assets are kept.
-    assets
-        Decode only this asset; may be repeated.
 
     Example
     -------

@@ -231,7 +231,7 @@ def predict(
     *,
     checkpoint: options.FileOrFolder,
     out: options.NewFolder,
-    assets: options.AssetIds = (),
+    assets: options.AssetsOrAll = (),
     gaussians: options.NewFile | None = None,
     seed: options.Seed = 42,
     far: Annotated[Any, options.ChoiceOf("slatprep.particles.transfer:Far")] = "background",
@@ -255,8 +255,6 @@ def predict(
         best.pt of a run of `slatprep train`, or the folder of the run.
     out
         Folder of the predictions; files of other assets are kept.
-    assets
-        Predict only this asset; may be repeated.
     gaussians : FILE.ply
         Also decode an image's latents to Gaussians, and write those with their materials.
     seed

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -203,11 +203,21 @@ def complete_asset(
     return []
 
 
-AssetIds = Annotated[tuple[str, ...], Click("--asset", metavar="ID", shell_complete=complete_asset)]
-
-AssetOption = Annotated[
-    str, "The asset of the store.", Click(metavar="ID", shell_complete=complete_asset)
+_NAMED = "by its id, a beginning of it, or the number of its row, from 0"
+_ASKED = Click("--asset", metavar="ID", shell_complete=complete_asset)
+AssetIds = Annotated[tuple[str, ...], f"An asset, {_NAMED}; may be repeated.", _ASKED]
+AssetsOrAll = Annotated[
+    tuple[str, ...], f"An asset, {_NAMED}; may be repeated. [default: all]", _ASKED
 ]
+AssetOption = Annotated[str, f"The asset, {_NAMED}.", _ASKED]
+
+
+def note_numbered(output: Output, store: Store, names: Iterable[str]) -> None:
+    """Print which assets are taken by their numbers, as a number may be meant to begin an id."""
+    for name in names:
+        if not (taken := store.ids[store.match(name)]).startswith(name):
+            output.note(f"--asset {name}: no id begins so; row {name} is taken, {taken}")
+
 
 NewStore = Annotated[
     PathOrUrl,

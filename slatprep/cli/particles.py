@@ -38,7 +38,7 @@ class MaterialOptions:
     prediction: options.File | None = None
     ranges: str | None = None
 
-    def field(self, points: Points) -> VoxelField:
+    def field(self, output: Output, points: Points) -> VoxelField:
         """Return the materials of a stored asset or of a prediction, one of which is given."""
         from slatprep.normalize import PIXIE_RANGES
         from slatprep.particles.fields import predicted_field, stored_field
@@ -52,7 +52,9 @@ class MaterialOptions:
                 raise ConfigError(
                     "--asset needs --store, which knows the ranges; --ranges does not go"
                 )
-            return stored_field(options.opened(store), self.asset, points)
+            opened = options.opened(store)
+            options.note_numbered(output, opened, [self.asset])
+            return stored_field(opened, self.asset, points)
         if points != "slat" or (store is not None and ranges is not None):
             raise ConfigError(
                 "--prediction goes with --store or --ranges, and without --points grid"
@@ -111,7 +113,7 @@ def transfer(
     from slatprep.particles import transfer as work
     from slatprep.particles.read import read_particles
 
-    field = material.field(points)
+    field = material.field(output, points)
     read, recognised = work.recognise_axes(read_particles(particles, axes), field, max_distance)
     if recognised:
         output.note(f"{particles}: {recognised}")
@@ -228,7 +230,7 @@ def simulate(
     if picture is not None:
         require_picture(picture)
     scene: Scene = work.prepare(
-        source.field("grid" if source.asset is not None else "slat"),
+        source.field(output, "grid" if source.asset is not None else "slat"),
         work.cells_of(source.store, source.asset),
         gaussians,
         axes,

@@ -9,7 +9,6 @@ disk, and workers that start without it would each compile all of them, at the s
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 import time
@@ -169,54 +168,43 @@ WHEN = (
 )
 """When kernels are compiled, for the user."""
 
-_FIRST_SHARE = 0.013
-"""Share of the time of all kernels that the first of them takes, by which the time is foretold."""
-
-_SIDE_BY_SIDE = 0.6
-"""Share of that time which two processes take."""
-
 
 class _Watch(event.Listener):
-    """Starts a second process at the first kernel to be compiled, and tells how long all takes."""
+    """Starts a second process at the first kernel to be compiled, and tells of it."""
 
     def __init__(self, note: Callable[[str], None] | None) -> None:
         self.note = note
         self.helper: subprocess.Popen[bytes] | None = None
-        self.begun = math.nan
         self._depth = 0
 
     def on_start(self, _event: Any) -> None:
         self._depth += 1
-        if math.isnan(self.begun):
-            self.begun = time.monotonic()
 
     def on_end(self, _event: Any) -> None:
         self._depth -= 1
         if self._depth or self.helper is not None:
             return
-        seconds = (time.monotonic() - self.begun) / _FIRST_SHARE
         if KEPT and cpu_count() > 1:
             code = "from slatprep.pipeline.asset import _compile_others; _compile_others()"
             self.helper = subprocess.Popen([sys.executable, "-c", code])
-            seconds *= _SIDE_BY_SIDE
         if self.note:
-            self.note(f"compiling the numerical kernels, {WHEN}: about {seconds:.0f} s")
+            self.note(f"compiling the numerical kernels, {WHEN}; it may take a minute")
         self.note = None
 
 
 def compile_kernels(note: Callable[[str], None] | None = None) -> None:
     """Compile all kernels of alignment, sampling and judgement, and keep them on disk.
 
-    `note` gets a line where something has to be compiled, with the seconds that this machine needs
-    by the first kernel, and one when that is done. Half of the kernels are compiled by a second
-    process. Where all are compiled already, this takes 1 s, once a process.
+    `note` gets a line where something has to be compiled, and one when that is done. Half of the
+    kernels are compiled by a second process. Where all are compiled already, this takes 1 s, once a
+    process.
     """
     start, watch = time.monotonic(), _Watch(note)
     with event.install_listener("numba:compile", watch):
         _process_a_bent_shape()
     if watch.helper is not None:
         watch.helper.wait()
-    if note and not math.isnan(watch.begun):
+    if note and watch.note is None:
         note(f"compiled in {time.monotonic() - start:.0f} s")
 
 

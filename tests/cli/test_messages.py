@@ -50,7 +50,9 @@ def of_kinds(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("subset", "STORE", "--asset", "NOBODY", "--out", "OUT"),
     ("transfer", "POINTS", "--store", "STORE", "--asset", "NOBODY", "--out", "OUT"),
 ])  # fmt: skip
-def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tmp_path):
+def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use_everywhere(
+    words, store, tmp_path
+):
     np.save(tmp_path / "p.npy", np.zeros((3, 3), np.float32))
     places = {"STORE": store, "OUT": tmp_path / "out", "POINTS": tmp_path / "p.npy"}
     for name, said in (
@@ -59,6 +61,9 @@ def test_a_name_that_no_asset_has_is_wrong_use_in_every_command(words, store, tm
     ):  # fmt: skip
         given = (places.get(word, name if word == "NOBODY" else word) for word in words)
         assert said in refused(*given)
+    given = (places.get(word, "3" if word == "NOBODY" else word) for word in words)
+    third = open_store(store).ids[3]
+    assert f"row 3 is taken, {third}\n" in run(*given, code=None).stderr
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [
