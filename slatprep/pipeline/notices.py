@@ -67,16 +67,18 @@ def dataset_notices(
 
 
 def much_clipped(store: Store) -> Iterator[str]:
-    """Yield which ranges cut off many of the values of a store."""
-    valid = float((store.column("valid_share") * np.diff(store.offsets)).sum())
-    counts = store.column("clipped").sum(axis=0).tolist()
-    for span, count in zip(store.normalization.ranges, counts, strict=True):
-        if count > _MOST_CLIPPED * valid:
+    """Yield which ranges cut off many values of a store, or most of an asset, and of which."""
+    valid = store.column("valid_share") * np.diff(store.offsets)
+    for span, counts in zip(store.normalization.ranges, store.column("clipped").T, strict=True):
+        lost = [store.ids[row] for row in np.flatnonzero(counts > 0.5 * valid)]
+        count, whole = counts.sum(), valid.sum()
+        if lost or count > _MOST_CLIPPED * whole:
             unit = ", in log10 of the SI value," if span.log10 else ""
+            some = f". They are most values of {_of_assets(lost, store.ids)}"
             yield (
-                f"{count / valid:.0%} of the values of {span.name} are beyond its range{unit} "
-                f"{span.lo:.4g} to {span.hi:.4g}, and were set to the end of it: see "
-                "normalize.ranges"
+                f"{100 * count / whole:.3g}% of the values of {span.name} are beyond its "
+                f"range{unit} {span.lo:.4g} to {span.hi:.4g}, and were set to the end of it: see "
+                f"normalize.ranges{some if 0 < len(lost) < len(store) else ''}"
             )
 
 
@@ -96,16 +98,15 @@ def unusual_sources(told: Mapping[str, str], failed: Sequence[FailedRecord] = ()
             for unit, count in refused.most_common(1):
                 these = "these" if len(texts) > 1 else "this"
                 also = f"; {count} refused assets look like {unit}, and {these} probably too"
-        first = next(iter(texts.values()))
-        yield (
-            f"{kind} of {len(texts):,} of {len(told):,} assets are unusual "
-            f"({_first(list(texts))}): {first}{also}"
-        )
+        first, text = next(iter(texts.items()))
+        whose = f"of {first}: " if len(texts) > 1 else ""
+        yield f"{kind} of {_of_assets(list(texts), told)} are unusual: {whose}{text}{also}"
 
 
 def stored_oddities(store: Store) -> list[str]:
-    """Say what is unusual of the sources of all assets of a store."""
-    return list(unusual_sources(dict(zip(store.ids, store.column("unusual"), strict=True))))
+    """Say what is unusual of the sources of all assets of a store, and what of it was clipped."""
+    told = dict(zip(store.ids, store.column("unusual"), strict=True))
+    return [*unusual_sources(told), *much_clipped(store)]
 
 
 def shared_rotation(new: NextStore) -> Iterator[str]:
@@ -174,6 +175,10 @@ def wild_ranges(
                 f"{ends[0]:.3g}, all others end at {ends[1]:.3g}. Look at its source, or give "
                 "normalize.ranges"
             )
+
+
+def _of_assets(names: Sequence[str], every: Collection[str]) -> str:
+    return f"{len(names):,} of {len(every):,} assets ({_first(names)})"
 
 
 def _first(names: Sequence[str]) -> str:

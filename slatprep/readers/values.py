@@ -182,4 +182,4 @@ def _parts(
 
 
 def _named(part: Part) -> str:
-    return f"its {part.name}" if part.name else "it"
+    return f"class {part.name}" if part.name else "the object"

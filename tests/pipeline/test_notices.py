@@ -51,7 +51,7 @@ def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
 
 
 def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
-    warn = dataset.parameters(pixieverse={"plausibility": "warn"})
+    warn = dataset.parameters(pixieverse={"plausibility": "warn"}, ranges="pixie")
     for name in "ab":
         grid = dataset.assets[name].grid
         grid[..., 1] /= 1e9
@@ -61,7 +61,11 @@ def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
     assert sorted(refused) == ["a", "b"]
     summary = build_store(warn, tmp_path / "s.zarr")
     (text,) = [text for text in summary.warnings if "unusual" in text]
-    assert text.startswith("values of 2 of 6 assets are unusual (a, b): the values look like")
+    assert text.startswith("values of 2 of 6 assets (a, b) are unusual: of a: the values look like")
+    clipped = next(text for text in summary.warnings if "youngs_modulus are beyond" in text)
+    assert "They are most values of 2 of 6 assets (a, b)" in clipped
+    for command in ("info", "list"):
+        assert f"unusual: {clipped}" in run(command, summary.store).stdout
     assert sum("unusual values: " in line for line in summary.records.open()) == 2
 
 
@@ -76,7 +80,9 @@ def test_unusual_values_are_told_with_what_refused_ones_look_like(dataset, tmp_p
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     assert [name for name, _ in summary.problems] == ["a", "b"]
     (text,) = [text for text in summary.warnings if "unusual" in text]
-    assert text.startswith("values of 1 of 4 assets are unusual (c): its snow (40% of the voxels)")
+    assert text.startswith(
+        "values of 1 of 4 assets (c) are unusual: class snow (40% of the voxels)"
+    )
     assert "; 2 refused assets look like MPa, and this probably too" in text
 
 
@@ -91,8 +97,8 @@ def test_odd_sources_are_told_by_the_build_and_of_its_store(dataset, tmp_path):
     out = tmp_path / "s.zarr"
     words = ("build-store", "--pixieverse", dataset.root / "pixieverse", "--slat",
              dataset.root / "slat", "--out", out, "--decoys", "0")  # fmt: skip
-    masks = "masks of 2 of 6 assets are unusual (b, d): clip_features_mask.npy leaves out "
-    latents = "latents of 1 of 6 assets are unusual (c): channel 7 of feats is the same in all rows"
+    masks = "masks of 2 of 6 assets (b, d) are unusual: of b: clip_features_mask.npy leaves out "
+    latents = "latents of 1 of 6 assets (c) are unusual: channel 7 of feats is the same in all rows"
     built = run(*words).stderr
     assert masks in built and latents in built
     assert "unusual" not in run(*words).stderr  # Nothing is new.

@@ -165,7 +165,7 @@ def test_what_is_stated_is_not_asked_about(read):
 def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(read):
     assert "is it in MPa?" in told(read((STATIONARY, 5e4, 2700, 0.25)))[0]
     field = read(*[(JELLY, 2e6, 930, 0.49)] * 4, (METAL, 200, 7850, 0.3))
-    assert "its metal (20% of the voxels) has" in told(field)[0]
+    assert "class metal (20% of the voxels) has" in told(field)[0]
     assert len(field.voxels) == 5 * 1600
 
 
