@@ -333,8 +333,9 @@ def report(output: Output, summary: BuildSummary) -> None:
                 names = ("asset_id", "verdict", "confidence", "fitness")
                 rows = map(attrgetter(*names), list_assets(store))
                 output.table("Assets", ("asset", *names[1:]), rows)
-        # "failed" beside the verdicts would be read as one of them.
-        words = {"failed": "not aligned" if summary.store is None else "not built"}
+        # "failed" beside the verdicts would be read as one of them, and "ok" as all but that.
+        done = "aligned" if summary.store is None else "built"
+        words = {"ok": done, "failed": f"not {done}"}
         others = ", ".join(f"{n:,} {words.get(key, key)}" for key, n in summary.statuses.items())
         say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
         if summary.unchanged:

@@ -170,6 +170,8 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
             )
         for words in one.reasons if len(checks) > 1 else one.words:
             say(f"{one.asset_id}: {words}")
+        for words in one.unusual:
+            say(f"{one.asset_id}: unusual: {words}")
         if not one.consistent:
             say(
                 f"{one.asset_id}: the store says {one.stored_verdict}, and its figures do not all "

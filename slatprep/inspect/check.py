@@ -105,6 +105,8 @@ class AlignmentCheck:
         PixieVerse frame to SLAT frame.
     radius : float
         Distance [voxel] up to which fitness counts a voxel as near the other side.
+    unusual : tuple of str
+        What is unusual of its values, masks, places or latents.
     """
 
     asset_id: str
@@ -114,6 +116,7 @@ class AlignmentCheck:
     figures: tuple[Figure, ...]
     transform: NDArray[np.float64]
     radius: float
+    unusual: tuple[str, ...]
 
     def value(self, name: str) -> float:
         """Return the value of a figure; NaN if the store does not have it."""
@@ -189,9 +192,9 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
         for name, values in means:
             mean = float(values.mean(dtype=np.float64)) if len(values) else math.nan
             figures.append(Figure(f"mean {name}", mean, mean, 0))
-    said = str(columns["verdict"])
+    said, odd = str(columns["verdict"]), tuple(str(columns["unusual"]).splitlines())
     return AlignmentCheck(
-        asset.asset_id, verdict, reasons, said, tuple(figures), asset.transform, radius
+        asset.asset_id, verdict, reasons, said, tuple(figures), asset.transform, radius, odd
     )
 
 

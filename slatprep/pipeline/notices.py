@@ -200,7 +200,7 @@ def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
         pooled = pooled_moments([(row.n_voxels, own) for row, own in known])
         yield (
             f"the latents look standardised already ({in_words(pooled)}) and are marked so; say "
-            'slat.standardised = "yes" if they are, "no" if they are not'
+            'standardised = "yes" in [slat] of a --config FILE if they are, "no" if not'
         )
     others = [name for name, look in looks.items() if look != latents.standardised]
     if others and standardised != "no":

@@ -228,8 +228,8 @@ def _pair_of(
     row: _Row, there: _Found, shared: str, grids: Sequence[adapters.FoundField]
 ) -> AssetPair:
     source = there.source
-    problems = [shared, *_name_problems(row)]
     sides: tuple[adapters.FoundField | NamedSlat, ...] = (*grids, *row.slats)
+    problems = [shared, *_name_problems(row, [repr(side.path) for side in sides if side.path])]
     for side in sides:
         problems += [side.problem, _unrecordable(side.path)]
     grid = mask = bounds = transform = None
@@ -293,14 +293,14 @@ def _lacking(row: _Row, there: _Found, side: str, tried: str) -> Iterator[str]:
         yield f"a {side} is called {other!r}: rename one, or join them with --map"
 
 
-def _name_problems(row: _Row) -> Iterator[str]:
+def _name_problems(row: _Row, files: Sequence[str]) -> Iterator[str]:
     for kind, name in (("id", row.object_id), ("view", row.view)):
         if name and not NAME.fullmatch(name):
             plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).lstrip(".")[:40] or "a"
             yield (
-                f"{kind} {name[:300]!r} is not allowed: rename its files, to {plain!r} for "
-                "instance; expected at most 255 letters a to z, digits, '.', '_' and '-', not "
-                "beginning with '.'"
+                f"{kind} {encoded(name)[:300]!r} is not allowed: rename "
+                f"{', '.join(files[:2]) or 'its files'}, to {plain!r} for instance. Take at most "
+                "255 letters A to Z and a to z, digits, '.', '_' and '-', and begin with no '.'"
             )
 
 

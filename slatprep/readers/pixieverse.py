@@ -18,7 +18,7 @@ from slatprep.geometry.voxels import voxels_at
 from slatprep.parameters import PixieverseSource, SampleParameters
 from slatprep.readers import files
 from slatprep.readers.adapters import Holding, SourceAdapter
-from slatprep.readers.values import require_plausible, require_possible, require_prediction
+from slatprep.readers.values import FOR_ALL, require_plausible, require_possible, require_prediction
 from slatprep.readers.voxel_sets import physical, physical_rows
 from slatprep.records import (
     BACKGROUND,
@@ -216,8 +216,8 @@ def _contradictions(
     )
     if min(left_out, empty) > _CONTRADICTS and plausibility == "refuse":
         expected = "the mask of this grid, in the same axes, or none: mask = [] in [pixieverse]"
-        raise InputError(path, fault, f'{expected}; or set plausibility = "warn" there')
-    way = "is it of this grid, and in the same axes? mask = [] in [pixieverse] reads none"
+        raise InputError(path, fault, f'{expected}; or set plausibility = "warn" there. {FOR_ALL}')
+    way = "is it of this grid, and in the same axes? mask = [] in [pixieverse] reads none at all"
     return [oddity("masks", f"{path.name} {fault}: {way}")]
 
 

@@ -7,7 +7,7 @@ values plausible is likely the one that was made.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import permutations, product
 from typing import Any, NamedTuple
@@ -202,10 +202,9 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
     )
     for pair in pairs[1:]:
         chosen = dict(zip(named, pair, strict=True))
-        given = ", ".join(f'{name} = "{unit}"' for name, unit in chosen.items() if unit)
         words = " and ".join(unit for unit in pair if unit)
         setting = (
-            f"or say units = {{ {given} }} in [pixieverse] of the dataset definition (a TOML file "
+            f"or say {in_toml(chosen)} in [pixieverse] of the dataset definition (a TOML file "
             "given with --config)"
         )
         yield Mistake(words, setting, partial(_scaled, pair))
@@ -223,6 +222,12 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
         yield Mistake(
             f"swapped columns, {' and '.join(moved)}", "look at the order", partial(_moved, order)
         )
+
+
+def in_toml(units: Mapping[str, str]) -> str:
+    """Say units by property as a dataset definition does; empty where none is stated."""
+    given = ", ".join(f'{name} = "{unit}"' for name, unit in units.items() if unit)
+    return given and f"units = {{ {given} }}"
 
 
 def _scaled(units: tuple[str, str], part: Part) -> Part:

@@ -24,6 +24,7 @@ from slatprep.records import (
     StructuredLatents,
     oddity,
 )
+from slatprep.records.encoders import LATENTS
 from slatprep.storage.place import storage_of
 
 
@@ -151,7 +152,13 @@ def checked_latents(
         sources,
         resolution=space.resolution,
     )
-    way = "name the encoder of a coarser grid as slat.encoder"
+    fits = [name for name, own in LATENTS.items()
+            if own.channels == space.channels and own.resolution < space.resolution]  # fmt: skip
+    way = (
+        "a small object has that; else the grid is coarser: name its encoder as slat.encoder "
+        f"({', '.join(fits) or 'a JSON file that describes it'}). That holds for all objects, so "
+        "give those of another grid a dataset of their own"
+    )
     warnings += low_places(latents.coords, space.resolution, way)
     enough = len(coords) >= ENOUGH and not space.standardised
     if enough and look_standardised(latents.moments, space):

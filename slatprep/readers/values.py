@@ -18,6 +18,7 @@ from slatprep.readers.plausible import (
     Part,
     beyond_all,
     fault_of,
+    in_toml,
     is_physical,
     mistakes_of,
     oddity_of,
@@ -39,6 +40,9 @@ _GUESS = re.compile(r"the values look like (.+?)(?: \(or |: )")
 
 _PREDICTED = 1.5
 """Half the values of a prediction lie within this; log10 of most densities is above it."""
+
+FOR_ALL = "Such keys hold for all objects: where this one alone is so, mend its file"
+"""What a person should know of a key that a message names."""
 
 _SAMPLE = 1024
 """Voxels that are looked at: enough for medians, and a tenth of a millisecond."""
@@ -78,12 +82,14 @@ def require_plausible(
         return [oddity("values", f"{_named(part)} has {told}") for part, told in odd]
     share = sum(part.share for part, _ in faults)
     (part, fault), *_ = sorted(faults, key=lambda one: -one[0].share)
+    stated = in_toml(vars(roots.units))
+    name = f"with {stated} {_named(part)}" if stated else _named(part)
     if share < _SHARE:
-        return [oddity("values", f"{_named(part)} ({share:.0%} of the voxels) has {fault}")]
+        return [oddity("values", f"{name} ({share:.0%} of the voxels) has {fault}")]
     likely = mistakes_of(parts, roots.units)
     if not likely and not is_physical(part):
         return []  # The reader refuses it, and says which voxel.
-    what = f"{_named(part)} has {fault}"
+    what = f"{name} has {fault}"
     advice = "values that a material has, in SI units"
     if likely:
         others = [one.words for one in likely[1:4]]
@@ -92,7 +98,9 @@ def require_plausible(
         advice = f"SI units, in the documented order; {likely[0].setting}"
     if roots.plausibility == "warn":
         return [oddity("values", f'{what}; taken as they are (plausibility = "warn")')]
-    raise InputError(where, what, f'{advice}; or set plausibility = "warn" in [pixieverse]')
+    raise InputError(
+        where, what, f'{advice}; or set plausibility = "warn" in [pixieverse]. {FOR_ALL}'
+    )
 
 
 def guess_in(reason: str) -> str:
@@ -133,7 +141,7 @@ def require_prediction(
     if plausibility == "warn":
         return [oddity("values", f'{what}; clipped (plausibility = "warn")')]
     advice = "a grid in SI units, channels last (numpy.moveaxis(grid, 0, -1)), or a prediction"
-    setting = '. plausibility = "warn" clips them' if plausibility else ""
+    setting = '. plausibility = "warn" clips those of all objects' if plausibility else ""
     raise InputError(where, what, advice + setting)
 
 

@@ -106,6 +106,8 @@ def test_odd_sources_are_told_by_the_build_and_of_its_store(dataset, tmp_path):
         shown = run(command, out).stdout
         assert f"unusual: {masks}" in shown and f"unusual: {latents}" in shown
         assert [text[:6] for text in document(command, out)["unusual"]] == ["latent", "masks "]
+    shown = run("check-alignment", out, "--asset", "c", "--picture", "none", code=None).stdout
+    assert "c: unusual: latents: channel 7 of feats is the same" in shown
 
 
 def test_one_asset_alone_does_not_tell_whether_it_is_standardised(make_dataset, tmp_path):
@@ -113,7 +115,7 @@ def test_one_asset_alone_does_not_tell_whether_it_is_standardised(make_dataset, 
     coords = dataset.assets["a"].coords
     narrow = np.random.default_rng(0).normal(size=(len(coords), 8)) * 0.4  # as of one asset
     dataset.write_slat("a.npz", coords, narrow.astype(np.float32))
-    with pytest.raises(ConfigError, match="one asset alone does not tell"):
+    with pytest.raises(ConfigError, match=r'or "no" in \[slat\] of a --config FILE'):
         build_store(dataset.parameters(), tmp_path / "s.zarr")
     said = dataset.parameters(slat={"standardised": "yes"})
     assert build_store(said, tmp_path / "s.zarr").statuses["ok"] == 1

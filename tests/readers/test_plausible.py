@@ -158,8 +158,10 @@ def test_what_is_stated_is_not_asked_about(read):
     with pytest.raises(InputError, match="aerogels"):
         read(aerogel)
     assert told(read(aerogel, units=Units(density="kg/m^3"))) == []
-    with pytest.raises(InputError, match=r"1e\+13, and all materials have 1 to 2e\+12 Pa"):
+    with pytest.raises(InputError, match=r"1e\+13, and all materials have 1 to 2e\+12 Pa") as error:
         read(aerogel, units=Units(youngs_modulus="GPa"))
+    assert 'with units = { youngs_modulus = "GPa" } class jelly has Young' in str(error.value)
+    assert "Such keys hold for all objects: where this one alone is so" in str(error.value)
 
 
 def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(read):

@@ -16,6 +16,7 @@ from slatprep.readers import read_latents, read_slat
 from slatprep.readers.contents import latent_space, look_standardised, tell_alone
 from slatprep.readers.slat_files import slat_patterns
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace, SourceFile
+from slatprep.records.encoders import LATENTS
 
 BATCHED = np.concatenate([np.zeros((3, 1), np.int32), COORDS.astype(np.int32)], axis=1)
 
@@ -141,7 +142,11 @@ def cloud(side: int = 64, count: int = 200) -> dict[str, np.ndarray]:
 def test_coordinates_of_a_grid_of_half_the_side_are_told(make_pair):
     (told,) = read_latents(make_pair(**cloud(32))).warnings
     assert told.startswith("unusual places: no coordinate is above 31, as on a grid of 32^3")
-    assert "slat.encoder" in told
+    assert "a small object has that" in told and "(a JSON file that describes it)" in told
+    cells = cloud(32) | {"feats": np.tile(cloud()["feats"], 4)}
+    pair = make_pair(**cells)
+    told = read_slat(pair.slat, pair.roots.slat, "", LATENTS["trellis2-pbr"]).warnings[0]
+    assert "(trellis2-512, trellis2-pbr-512)" in told
     assert read_latents(make_pair(**cloud(64))).warnings == ()
     assert read_latents(make_pair(**cloud(32, count=20))).warnings == ()
 

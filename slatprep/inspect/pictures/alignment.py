@@ -172,7 +172,7 @@ def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str, left
     canvas.write(figure, _LEFT, 50, title, **bold)
     canvas.note(figure, _LEFT, 76, subtitle, 7.5)
     canvas.write(figure, left, 50, f"alignment {check.verdict}", color=colour, **bold)
-    reasons = list(check.words)
+    reasons = [*check.words, *(f"unusual: {words}" for words in check.unusual)]
     if not check.consistent:
         reasons.append("the store's figures do not all agree with its voxels")
     lines = [line for reason in reasons for line in textwrap.wrap(reason, 51)]
