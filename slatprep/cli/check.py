@@ -41,8 +41,10 @@ def check_alignment(
 ) -> None:
     """Check whether the alignment of an asset of STORE is good, and draw it.
 
-    Its quality is recomputed from the stored arrays, and compared with the
-    stored figures. A picture shows both sides before and after from three
+    Its quality is computed from the stored arrays, and its labels are looked up
+    again. Each figure agrees with the stored one if it differs by no more than
+    the tolerance. Changes are from a voxel's stored label to the one found now.
+    A picture shows both sides before and after from three
     directions, the error of every voxel, the candidates and the verdict.
     --asset, --worst and --ambiguous may be combined. The exit code is 1 unless
     all are good and the store agrees with itself. Without STORE, the one that
@@ -154,7 +156,7 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
         if len(checks) == 1 or output.verbosity > 0:
             output.table(
                 f"{one.asset_id}: alignment {one.verdict}",
-                ("figure", "computed", "good", "is good", "stored", "may differ by", "agrees"),
+                ("figure", "computed", "good if", "passes", "stored", "tolerance", "agrees"),
                 [
                     (
                         figure.name,
@@ -202,8 +204,9 @@ def score(output: Output, store: options.FolderOrUrl, truth_dir: options.Folder)
     level leave out symmetric assets. Success is a mean displacement less than
     1.5 voxels above that of the best similarity. Displacement is the median,
     p90 the 90th percentile. Labels is the share of right classes; without
-    classes, of right properties. Beside it stands what the best similarity and
-    the true places would give. The exit code is 1 if an asset with a truth is
+    classes, of right properties. Similarity displacement and similarity labels
+    are what the best similarity would give, true-place labels what the true
+    places would. The exit code is 1 if an asset with a truth is
     not in the store.
 
     Example
@@ -219,8 +222,9 @@ def score(output: Output, store: options.FolderOrUrl, truth_dir: options.Folder)
         if output.verbosity > 0:
             output.table(
                 "Assets against truth",
-                ("asset", "name", "level", "symmetric", "displacement", "best similarity",
-                 "labels", "best similarity", "true places", "valid"),
+                ("asset", "name", "level", "symmetric", "displacement",
+                 "similarity displacement", "labels", "similarity labels", "true-place labels",
+                 "valid"),
                 map(
                     attrgetter("asset_id", "name", "level", "symmetric", "displacement",
                                "similarity_displacement", *labels),
@@ -229,7 +233,7 @@ def score(output: Output, store: options.FolderOrUrl, truth_dir: options.Folder)
             )  # fmt: skip
         output.table(
             "Places against truth (non-symmetric assets; displacement in voxels)",
-            ("level", "assets", "success", "displacement", "p90", "best similarity"),
+            ("level", "assets", "success", "displacement", "p90", "similarity displacement"),
             [
                 (f"L{s.level}", s.assets, s.success, s.displacement_median, s.displacement_p90,
                  s.similarity_displacement)
@@ -238,7 +242,7 @@ def score(output: Output, store: options.FolderOrUrl, truth_dir: options.Folder)
         )  # fmt: skip
         output.table(
             "Labels against truth (of the same assets; shares)",
-            ("level", "labels", "best similarity", "true places", "valid"),
+            ("level", "labels", "similarity labels", "true-place labels", "valid"),
             [(f"L{s.level}", *attrgetter(*labels)(s)) for s in report.levels],
         )
 

@@ -301,8 +301,8 @@ def _show_statistics(output: Output, found: StoreStatistics) -> None:
     chosen = f"{found.assets_chosen:,} of {found.assets:,} assets"
     output.record(f"{chosen}, weighted by {found.weight}", {**found.total.verdicts})
     output.table(
-        "Voxels before and after the lookup, and the share that is not annotated",
-        ("group", "assets", "before", "share", "none", "after", "share", "none"),
+        "Voxels before and after the lookup",
+        ("group", "assets", "before", "share", "no label", "after", "share", "not valid"),
         [
             (name, *_voxels(own))
             for name, own in groups.items()
@@ -310,7 +310,7 @@ def _show_statistics(output: Output, found: StoreStatistics) -> None:
         ],
     )
     output.table(
-        "Properties of all annotated voxels",
+        "Properties of the annotated voxels before the lookup, the valid after",
         ("property", "lookup", "mean", "std", "5%", "50%", "95%"),
         [
             (f"{name}{_unit(own.unit)}", side, *_spread(own.si))

@@ -127,13 +127,21 @@ class AlignmentCheck:
         """The reasons of the verdict: why it is not better, or what makes it good."""
         if self.reasons:
             return self.reasons
-        forward, backward, open_share = map(self.value, (*FITNESS, "ambiguity"))
+        open_share = self.value("ambiguity")
         ties = f"the class of {open_share:.1%} of the voxels" if open_share else "no class"
-        return (
-            f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary lie "
-            f"within {self.radius:g} voxel of the other side before any deformation; placements "
-            f"that fit as well change {ties}",
-        )
+        if all(figure.ok for figure in self.figures if figure.name in _QUALITY):
+            sure, same, placed = map(self.value, ("confidence", "same_object", "right_placement"))
+            rests = (
+                f"confidence {sure:.1%}: the two sides show the same object with a probability of "
+                f"{same:.1%}, and its placement is right with {placed:.1%}"
+            )
+        else:  # Those probabilities hold for the stored fit alone: the verdict rests on this one.
+            forward, backward = map(self.value, FITNESS)
+            rests = (
+                f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary "
+                f"lie within {self.radius:g} voxel of the other side before any deformation"
+            )
+        return (f"{rests}; placements that fit as well change {ties}",)
 
     @property
     def consistent(self) -> bool:
@@ -173,14 +181,14 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
 
     def largest(name: str, array: str) -> Figure:
         most = float(differs[array].max(initial=0.0))
-        return Figure(f"largest difference of a {name}", most, 0, TOLERANCES[array])
+        return Figure(f"largest change of a {name}", most, 0, TOLERANCES[array])
 
     figures += [
         Figure("valid_share", valid_share, float(columns["valid_share"]), QUALITY_TOLERANCE),
         stored("ambiguity", alignment.settled_by is not None),
         stored("margin"),
-        Figure("voxels with another valid", differs["voxel/valid"].sum(), 0, 0),
-        Figure("voxels with another material", differs["voxel/material"].sum(), 0, 0),
+        Figure("voxels whose valid changes", differs["voxel/valid"].sum(), 0, 0),
+        Figure("voxels whose material changes", differs["voxel/material"].sum(), 0, 0),
         largest("property", "voxel/properties"),
         largest("distance", "voxel/distance"),
     ]

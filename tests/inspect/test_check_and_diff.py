@@ -175,10 +175,10 @@ def test_a_wrong_transform_is_found(copy):
 
 def test_changed_voxels_a_changed_grid_and_a_changed_verdict_are_found(copy):
     figures = {
-        "voxel/material": (5, "voxels with another material"),
-        "voxel/valid": (False, "voxels with another valid"),
-        "voxel/properties": (0.123, "largest difference of a property"),
-        "voxel/distance": (9.0, "largest difference of a distance"),
+        "voxel/material": (5, "voxels whose material changes"),
+        "voxel/valid": (False, "voxels whose valid changes"),
+        "voxel/properties": (0.123, "largest change of a property"),
+        "voxel/distance": (9.0, "largest change of a distance"),
     }
     for row, (array, (value, _)) in enumerate(figures.items()):
         rewrite(copy, array, row, value)
@@ -188,10 +188,10 @@ def test_changed_voxels_a_changed_grid_and_a_changed_verdict_are_found(copy):
     other = check_alignment(store, "bear.front")
     assert not wrong(other) and not other.consistent and not other.ok
     rewrite(copy, "voxel/properties", int(store.offsets[3]), np.nan)
-    assert wrong(check_alignment(copy, "cup")) == {"largest difference of a property"}
+    assert wrong(check_alignment(copy, "cup")) == {"largest change of a property"}
     material = store.asset("dog").grid_material
     rewrite(copy, "grid/material", 4, np.where(material == 0, 6, material))
-    assert wrong(check_alignment(copy, "dog")) == {"voxels with another material"}
+    assert wrong(check_alignment(copy, "dog")) == {"voxels whose material changes"}
     with pytest.raises(StoreError, match="no asset"):
         check_alignment(store, "nobody")
 

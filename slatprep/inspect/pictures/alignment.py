@@ -189,7 +189,7 @@ def _legend(figure: Figure, scene: Scene) -> None:
     share = np.bincount(scene.slat_material, minlength=256) / max(len(scene.slat_material), 1)
     if len(present) > len(MATERIAL_CLASSES):  # Perhaps not all find room: the largest do.
         present = present[np.argsort(-share[present], kind="stable")]
-    names = [*scene.labels, *["no annotation"] * (256 - len(scene.labels))]
+    names = [*scene.labels, *["not valid"] * (256 - len(scene.labels))]
     entries = [(f"{names[k]}  {share[k]:.1%}", MATERIAL_COLOURS[int(k)]) for k in present]
     columns = 4 if scene.deformed is None else 3  # The fourth is above the scale.
     canvas.note(figure, _LEFT, y, "share of the SLAT voxels:", 6.8)

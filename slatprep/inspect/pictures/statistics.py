@@ -67,7 +67,7 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
     words = (
         f"{statistics.assets_chosen:,} of {statistics.assets:,} assets ({counts}); "
         f"every {what} one; not annotated: {_percent(statistics.total.field.unannotated)} before, "
-        f"{_percent(statistics.total.slat.unannotated)} after"
+        f"not valid: {_percent(statistics.total.slat.unannotated)} after"
     )
     canvas.note(figure, 40, 74, words)
     entries = [
@@ -129,7 +129,7 @@ def _bars(axes: Axes, names: list[str], bars: list[dict[str, float]]) -> None:
     axes.set_xlim(0, 1)
     axes.set_ylim(max(len(bars), 1) - 0.5, -0.5)
     axes.set_yticks(places, names, parse_math=False)  # Names may contain $.
-    axes.set_xlabel("share of annotated voxels, by category (assets)")
+    axes.set_xlabel("share of the voxels with a class, by category (assets)")
 
 
 def _shares(weights: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -34,8 +34,9 @@ from slatprep.store.records import StoredRecords, build_in
 _PROPERTY_COLOURS = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80",
                      "#5EC962", "#ADDC30", "#FDE725")  # fmt: skip
 
-_FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "inlier_rmse",
-            "overlap", "valid_share", "ambiguity", "margin")  # fmt: skip
+_FIGURES = ("confidence", "same_object", "right_placement", "expected_accuracy", "fitness",
+            "fitness_backward", "inlier_rmse", "overlap", "valid_share", "ambiguity",
+            "margin")  # fmt: skip
 
 _UNTOLD: Mapping[str, Any] = {"ties": [], "reasons": []}
 """What the table says of an asset without the records of its build."""
@@ -51,6 +52,8 @@ _ABSENT = {Status.FAILED: "not built", Status.SKIPPED: "skipped"}
 
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 
+_PATH = re.compile(r"^(?:/.*?|\S*[/\\.]\S*): ")
+"""The path that a reason begins with."""
 
 Columns = dict[str, Any]
 """What the table on the page says of one asset, by the names of its columns."""
@@ -108,7 +111,7 @@ def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
     parts = {}
     common: dict[tuple[str, ...], list[str]] = {}
     for reason in reasons:
-        fault = re.sub(r"^\S*[/\\.]\S*: ", "", reason.partition("; expected")[0])
+        fault = _PATH.sub("", reason.partition("; expected")[0])
         words, numbers = tuple(_NUMBER.split(fault)), _NUMBER.findall(fault)
         known = common.setdefault(words, numbers)
         common[words] = [a if a == b else "N" for a, b in zip(known, numbers, strict=True)]
@@ -152,6 +155,7 @@ def page_content(
             for name, value in sorted(entries.items())
         ],
         "voxels": int(store.offsets[-1]),
+        "path": _PATH.pattern,
         "engine": sorted(set(map(str, store.column("engine")))),
         "thresholds": {name: limit for name, (_, _, limit) in LIMITS.items()},
         "classes": [
@@ -184,6 +188,7 @@ def page_content(
             "assets": sum(states.values()),
             "states": states,
             "ambiguous": int((store.column("ambiguity") > THRESHOLDS.good_ambiguity).sum()),
+            "unusual": int((store.column("unusual") != "").sum()),
         },
     }
 
@@ -264,6 +269,7 @@ def _table(
         "id": [store.ids[row] for row in listed],
         "category": map(str, store.column("category")[rows]),
         "state": map(str, store.column("verdict")[rows]),
+        "unusual": [str(lines).splitlines() for lines in store.column("unusual")[rows]],
         "voxels": np.diff(store.offsets)[rows].tolist(),
         "unphysical": store.column("unphysical")[rows].tolist(),
         "model": map(str, store.column("model")[rows]),

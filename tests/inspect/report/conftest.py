@@ -22,6 +22,8 @@ def hostile(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory)
     manifests = Path(shutil.copytree(mixed_build.records.parent, folder / "mixed.manifests"))
     categories = np.array(["animal", "animal", "animal", HOSTILE, "vessel"], dtype=object)
     rewrite(store, "asset/category", slice(None), categories)
+    unusual = ["", "", "", f"masks: {HOSTILE}\nvalues: is it in MPa?", ""]
+    rewrite(store, "asset/unusual", slice(None), np.array(unusual, dtype=object))
     edit_record(store, 0, lambda record: record["judgement"].update(reasons=[HOSTILE]))
 
     def give_reasons(build: dict[str, Any]) -> None:

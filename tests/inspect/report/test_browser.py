@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -92,6 +93,14 @@ def page_of(made: BuildSummary, path: Path) -> Report:
     return Report(store, manifests, path)
 
 
+def cut(browser: Chrome) -> list[str]:
+    """Return the headings and numbers of the table that are not shown whole."""
+    script = """const shown = (cell) => cell.clientWidth && cell.scrollWidth > cell.clientWidth;
+        return [...document.querySelectorAll("thead button, thead .plain, td.right")].filter(shown)
+        .map((cell) => cell.textContent)"""
+    return list(browser.execute_script(script))
+
+
 def rows(browser: Chrome) -> list[str]:
     script = "return [...document.querySelectorAll('td.id')].map(cell => cell.textContent)"
     return list(browser.execute_script(script))
@@ -162,6 +171,39 @@ def test_it_opens_sorts_and_filters(opened):
     assert HOSTILE in opened.find_element("id", "balance").text
     assert HOSTILE in opened.find_element("id", "why").text
     assert_quiet(opened)
+
+
+def test_a_good_verdict_is_no_more_than_it_rests_on(opened):
+    assert "assets good\n100.0 %\n" in opened.find_element("id", "tiles").text  # of those stored
+    assert cut(opened) == []
+    unusual = opened.find_elements("css selector", "#statelist .chip")[-1]
+    assert unusual.text == "⚠ unusual 1"
+    unusual.click()
+    assert rows(opened) == ["cup"]
+    row = opened.find_element("css selector", "tbody tr:not(.space)")
+    assert "⚠" in row.text and f"unusual masks: {HOSTILE}" in row.text
+    row.click()
+    told = opened.find_element("id", "asset-reasons").text
+    assert told == f"unusual masks: {HOSTILE}\nunusual values: is it in MPa?"
+    share = r"\d+\.\d %"
+    rests = rf"good: confidence {share} = same object {share} . right placement {share}"
+    assert re.search(rests, opened.find_element("id", "asset-state").text)
+    click(opened, "#close")
+    click(opened, "#applied .chip")
+    assert len(rows(opened)) == 7
+    search = opened.find_element("id", "search")
+    search.send_keys("in mpa?")
+    assert rows(opened) == ["cup"]
+    assert_quiet(opened)
+
+
+def test_a_reason_is_shown_without_its_path(browser, mixed_build, tmp_path):
+    open_page(browser, page_of(mixed_build, tmp_path / "page.html"))
+    click(browser, "#state-chips [data-state='not built']")
+    cell = browser.find_element("css selector", "tbody tr:not(.space) td:nth-child(4)")
+    whole, told = cell.get_attribute("title"), "the SLAT is empty; expected at least one voxel"
+    assert whole.startswith("/") and whole.endswith(f"torn.npz: {told}")
+    assert cell.text == f"not built\n{told}"
 
 
 def test_it_opens_an_asset_that_turns(opened):
@@ -307,12 +349,9 @@ def test_a_phone_shows_whole_headings_and_numbers(browser, hostile):
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
     try:
         open_page(browser, hostile)
-        widths = """const shown = (cell) => cell.clientWidth && cell.textContent;
-            return [...document.querySelectorAll("thead button, td.right")].filter(shown)
-            .map((cell) => [cell.textContent, cell.scrollWidth <= cell.clientWidth])"""
-        fits = browser.execute_script(widths)
-        assert {"Asset", "State", "Confidence"} <= {text for text, _ in fits}
-        assert [text for text, whole in fits if not whole] == []
+        head = browser.find_element("css selector", "thead").text
+        assert all(title in head for title in ("Asset", "Verdict", "Confidence"))
+        assert cut(browser) == []
         page = "return document.documentElement.scrollWidth - innerWidth"
         assert browser.execute_script(page) == 0
     finally:

@@ -77,6 +77,7 @@ def test_every_asset_is_listed_with_its_state_and_why(page):
     assert assets["state"] == ["good"] * 5 + ["skipped", "not built"]
     assert assets["reasons"][0] == [HOSTILE]
     assert assets["reasons"][1] == []
+    assert assets["unusual"][2:5] == [[], [f"masks: {HOSTILE}", "values: is it in MPa?"], []]
     assert "SLAT" in assets["reasons"][5][0]
     assert assets["picture"] == [0, 1, 2, 3, 4, None, None]
     assert assets["annotations"] == [None] * 7
@@ -203,7 +204,8 @@ def test_of_a_store_too_large_to_list_a_sample_is_listed(hostile, page, tmp_path
     states = {state: whole["assets"]["state"].count(state) for state in whole["assets"]["state"]}
     # The same assets as `slatprep info` and `check-alignment --ambiguous` count.
     ambiguous = overview_of(store).total.ambiguous
-    expected = {"stored": 5, "assets": 7, "states": states, "ambiguous": ambiguous}
+    expected = {"stored": 5, "assets": 7, "states": states, "ambiguous": ambiguous,
+                "unusual": 1}  # fmt: skip
     assert found["all"] == whole["all"] == expected
     clips = [[one["clipped"] for one in content["properties"]] for content in (found, whole)]
     assert clips[0] == clips[1]
@@ -275,9 +277,10 @@ def test_other_records_are_refused(hostile, tmp_path):
 
 def test_numbers_that_all_reasons_of_a_kind_share_are_kept():
     reasons = [f"only {share}% lie within 1 voxel (good: 80%)" for share in (76.1, 9)]
-    kinds = kinds_of([*reasons, "a/b.npz: holds 3 rows; expected 2"])
+    paths = ("a/b.npz", "/a b/c d.npz")
+    kinds = kinds_of([*reasons, *(f"{path}: holds 3 rows; expected 2" for path in paths)])
     assert [kinds[reason] for reason in reasons] == ["only N% lie within 1 voxel (good: 80%)"] * 2
-    assert kinds["a/b.npz: holds 3 rows; expected 2"] == "holds 3 rows"
+    assert {kinds[f"{path}: holds 3 rows; expected 2"] for path in paths} == {"holds 3 rows"}
 
 
 # -- the command --------------------------------------------------------------

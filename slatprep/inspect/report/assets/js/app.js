@@ -1,18 +1,19 @@
 /* Filters, theme, and one asset: what ties the parts together. */
 
 const Filter = (() => {
-  const initial = () => ({ text: "", category: null, model: null, states: null, kind: null, turn: null, bin: null });
+  const initial = () => ({ text: "", category: null, model: null, states: null, unusual: null, kind: null, turn: null, bin: null });
   let chosen = initial();
   let listeners = [];
-  const haystack = ASSETS.id.map((id, k) => `${id}\n${ASSETS.category[k]}\n${ASSETS.reasons[k].join("\n")}`.toLowerCase());
+  const haystack = ASSETS.id.map((id, k) => `${id}\n${ASSETS.category[k]}\n${[...ASSETS.reasons[k], ...unusualOf(k)].join("\n")}`.toLowerCase());
 
   function matches(index) {
-    const { text, category, model, states, kind, turn, bin } = chosen;
+    const { text, category, model, states, unusual, kind, turn, bin } = chosen;
     return (
       (!text || haystack[index].includes(text)) &&
       (category === null || ASSETS.category[index] === category) &&
       (model === null || ASSETS.model[index] === model) &&
       (states === null || states.includes(ASSETS.state[index])) &&
+      (unusual === null || unusualOf(index).length > 0) &&
       (kind === null || ASSETS.kinds[index].includes(kind)) &&
       (turn === null || ASSETS.turn[index] === turn) &&
       (bin === null || (ASSETS[bin.key][index] !== null && Charts.binOf(ASSETS[bin.key][index], bin.domain, bin.bins) === bin.bin))
@@ -32,6 +33,7 @@ const Filter = (() => {
     byId("model").value = chosen.model === null ? "*" : `=${chosen.model}`;
     if (byId("search").value.toLowerCase().trim() !== chosen.text) byId("search").value = chosen.text;
     const applied = [];
+    if (chosen.unusual !== null) applied.push(["unusual", "unusual"]);
     if (chosen.kind !== null) applied.push(["kind", `reason: ${chosen.kind.replace(/\bN\b/g, "…")}`]);
     if (chosen.turn !== null) applied.push(["turn", `rotation: ${CONTENT.turns[chosen.turn]}`]);
     if (chosen.bin !== null) applied.push(["bin", `${chosen.bin.title}: ${chosen.bin.text}`]);
@@ -112,8 +114,11 @@ const Detail = (() => {
     const value = (name) => ASSETS[name][index];
     byId("asset-title").replaceChildren(value("id"), el("small", {}, value("category") || "category unknown"));
     const { means } = STATES.find((state) => state.name === value("state"));
-    byId("asset-state").replaceChildren(stateTag(value("state")), `: ${means}`);
-    byId("asset-reasons").replaceChildren(...value("reasons").map((reason) => el("li", {}, reason)));
+    const parts = ["confidence", "same_object", "right_placement"].map(value);
+    const [confidence, object, placement] = parts.map((share) => Format.share(share));
+    const rests = parts[0] === null ? means : `confidence ${confidence} = same object ${object} × right placement ${placement}`;
+    byId("asset-state").replaceChildren(stateTag(value("state")), `: ${rests}`);
+    byId("asset-reasons").replaceChildren(...[...value("reasons"), ...unusualOf(index)].map((reason) => el("li", {}, reason)));
     byId("asset-figures").replaceChildren(...figures(value));
     byId("previous").disabled = Table.neighbour(index, -1) === null;
     byId("next").disabled = Table.neighbour(index, 1) === null;

@@ -5,12 +5,18 @@ const ASSETS = CONTENT.assets;
 const TOTAL = ASSETS.id.length;
 
 const STATES = [
-  { name: "good", sign: "✓", means: "the surfaces lie on each other" },
+  { name: "good", sign: "✓", means: "probably the same object, rightly placed" },
   { name: "doubtful", sign: "?", means: "should be looked at" },
-  { name: "failed", sign: "!", means: "the surfaces do not lie on each other" },
+  { name: "failed", sign: "!", means: "probably another object, or wrongly placed" },
   { name: "not built", sign: "✕", means: "could not be used, not in the store" },
   { name: "skipped", sign: "–", means: "a partner is missing, not in the store" },
 ];
+
+/** Say what is unusual of an asset's sources, a text for each kind. */
+const unusualOf = (index) => (ASSETS.unusual[index] ?? []).map((line) => `unusual ${line}`);
+
+/** A reason without the path that it begins with. */
+const withoutPath = (reason) => reason.replace(new RegExp(CONTENT.path), "");
 
 const SYMBOLS = { youngs_modulus: "E", density: "ρ", poissons_ratio: "ν" };
 const PROPERTY_NAMES = {};

@@ -6,7 +6,7 @@ const Sections = (() => {
 
   function states(filter) {
     const counts = STATES.map((state) => ({ ...state, count: CONTENT.all.states[state.name] ?? 0 }));
-    const { stored: inStore, assets: total, ambiguous } = CONTENT.all;
+    const { stored: inStore, ambiguous, unusual } = CONTENT.all;
     byId("title").textContent = CONTENT.name || CONTENT.title;
     const engine = CONTENT.engine.join(", ");
     byId("lede").textContent =
@@ -15,9 +15,9 @@ const Sections = (() => {
     const valid = known(ASSETS.valid_share.map((share, k) => (share === null ? null : share * ASSETS.voxels[k])));
     const sum = (values) => values.reduce((total, value) => total + value, 0);
     const tiles = [
-      ["assets good", Format.share(counts[0].count / total)],
+      ["assets good", Format.share(counts[0].count / inStore)],
       ["SLAT voxels", Format.count(CONTENT.voxels)],
-      ["of them annotated", Format.share(sum(valid) / sum(known(ASSETS.voxels)), 2)],
+      ["of them valid", Format.share(sum(valid) / sum(known(ASSETS.voxels)), 2)],
       ["median fitness", Format.fixed(3)(Format.quantile(known(ASSETS.fitness), 0.5))],
       ["median rmse, voxels", Format.fixed(3)(Format.quantile(known(ASSETS.inlier_rmse), 0.5))],
     ];
@@ -33,9 +33,12 @@ const Sections = (() => {
     );
     byId("statelist").replaceChildren(
       ...counts.map((state) =>
-        el("button", { type: "button", class: "chip", title: state.means, onclick: () => filter.only("states", [state.name]) }, stateTag(state.name), ` ${Format.count(state.count)} · ${Format.share(state.count / total)}`),
+        el("button", { type: "button", class: "chip", title: state.means, onclick: () => filter.only("states", [state.name]) }, stateTag(state.name), ` ${Format.count(state.count)}`),
       ),
     );
+    if (unusual) {
+      byId("statelist").append(el("button", { type: "button", class: "chip", title: "values, masks, places or latents that few sources have", onclick: () => filter.only("unusual", true) }, `⚠ unusual ${Format.count(unusual)}`));
+    }
     why(filter);
   }
 
@@ -58,11 +61,11 @@ const Sections = (() => {
     }
     const list = el("div", { class: "why" });
     for (const row of rows.slice(0, 20)) {
-      const text = row.count === 1 ? row.example : row.kind.replace(/\bN\b/g, "…");
+      const text = row.count === 1 ? withoutPath(row.example) : row.kind.replace(/\bN\b/g, "…");
       list.append(
         el("span", { class: "number" }, Format.count(row.count)),
         stateTag(row.state),
-        el("button", { type: "button", class: "link", onclick: () => filter.only("kind", row.kind) }, text),
+        el("button", { type: "button", class: "link", title: row.example, onclick: () => filter.only("kind", row.kind) }, text),
       );
     }
     byId("why").replaceChildren(list);
@@ -242,7 +245,7 @@ const Sections = (() => {
     const { side, assets } = CONTENT.detail;
     const { stored: inStore, assets: total } = CONTENT.all;
     const notes = [];
-    if (TOTAL < total) notes.push(`This page shows a sample: ${Format.count(TOTAL)} of ${Format.count(total)} assets are in its table and in its charts and medians; counts of assets by state and of ties, and of SLAT voxels, are of all.`);
+    if (TOTAL < total) notes.push(`This page shows a sample: ${Format.count(TOTAL)} of ${Format.count(total)} assets are in its table and in its charts and medians; counts of assets by verdict and of ties, and of SLAT voxels, are of all.`);
     if (side < 64) notes.push(`To keep this page small, 3D views show ${side}³ voxels: each stands for 2 × 2 × 2 of the store's.`);
     if (assets < inStore) notes.push(`${Format.count(assets)} of ${Format.count(inStore)} assets have a thumbnail and a 3D view, and make up the distributions: those with a doubtful or failed alignment first, the rest evenly chosen.`);
     byId("detail-hint").textContent = notes.join(" ");

@@ -9,15 +9,15 @@ const Table = (() => {
     { key: "picture", title: "Front, right, top", width: 142 },
     { key: "id", title: "Asset", width: 118, value: (i) => ASSETS.id[i] },
     { key: "category", title: "Category", width: 96, value: (i) => ASSETS.category[i] || null, text: (i) => ASSETS.category[i] || Format.NONE, wide: true },
-    { key: "state", title: "State", width: 130, value: (i) => STATES.findIndex((state) => state.name === ASSETS.state[i]) },
+    { key: "state", title: "Verdict", width: 160, value: (i) => STATES.findIndex((state) => state.name === ASSETS.state[i]) },
     { key: "model", title: "Model", width: 92, value: (i) => ASSETS.model[i], text: (i) => ASSETS.model[i] ?? Format.NONE, wide: true },
     { key: "confidence", title: "Confidence", width: 108, ...number("confidence", 3) },
-    { key: "expected_accuracy", title: "Expected accuracy", width: 140, ...share("expected_accuracy"), wide: true },
-    { key: "fitness", title: "Fitness", width: 76, ...number("fitness", 3), wide: true },
-    { key: "fitness_backward", title: "Fitness backward", width: 132, ...number("fitness_backward", 3), wide: true },
-    { key: "inlier_rmse", title: "Inlier rmse", width: 100, ...number("inlier_rmse", 3), wide: true },
-    { key: "valid_share", title: "Valid share", width: 100, ...share("valid_share"), wide: true },
-    { key: "ambiguity", title: "Ambiguity", width: 92, ...share("ambiguity"), wide: true },
+    { key: "expected_accuracy", title: "Expected accuracy", width: 104, ...share("expected_accuracy"), wide: true },
+    { key: "fitness", title: "Fitness", width: 84, ...number("fitness", 3), wide: true },
+    { key: "fitness_backward", title: "Fitness backward", width: 104, ...number("fitness_backward", 3), wide: true },
+    { key: "inlier_rmse", title: "Inlier rmse", width: 76, ...number("inlier_rmse", 3), wide: true },
+    { key: "valid_share", title: "Valid share", width: 80, ...share("valid_share"), wide: true },
+    { key: "ambiguity", title: "Ambiguity", width: 108, ...share("ambiguity"), wide: true },
     { key: "displacement", title: "Displaced", width: 98, ...number("displacement", 1), wide: true },
     { key: "tilt", title: "Tilt", width: 58, value: (i) => ASSETS.tilt[i], text: (i) => (ASSETS.tilt[i] === null ? Format.NONE : `${ASSETS.tilt[i].toFixed(1)}°`), right: true, wide: true },
     { key: "voxels", title: "Voxels", width: 76, value: (i) => ASSETS.voxels[i], text: (i) => Format.count(ASSETS.voxels[i]), right: true, wide: true },
@@ -32,7 +32,7 @@ const Table = (() => {
     fitness: "Share of PixieVerse boundary voxels with a SLAT voxel within the radius, before any deformation",
     fitness_backward: "Share of SLAT voxels with a PixieVerse boundary voxel within the radius, before any deformation",
     inlier_rmse: "Root mean square distance of those, in voxels",
-    valid_share: "Share of SLAT voxels that found an annotation",
+    valid_share: "Share of SLAT voxels that are valid: that found an annotation",
     ambiguity: "Share of SLAT voxels whose class depends on the choice among tied placements",
     displacement: "Largest distance between tied placements, in voxels",
     tilt: "Angle to the nearest quarter turn",
@@ -151,8 +151,10 @@ const Table = (() => {
       return el("td", { class: "id", title: ASSETS.id[index] }, ASSETS.id[index]);
     }
     if (column.key === "state") {
-      const reasons = ASSETS.reasons[index].join("; ");
-      return el("td", { title: reasons }, stateTag(ASSETS.state[index]), ...(reasons ? [el("small", {}, reasons)] : []));
+      const [reasons, unusual] = [ASSETS.reasons[index], unusualOf(index)];
+      const told = [...unusual, ...reasons.map(withoutPath)].join("; ");
+      const mark = unusual.length ? [el("span", { class: "unusual", "aria-hidden": "true" }, "⚠")] : [];
+      return el("td", { title: [...unusual, ...reasons].join("; ") }, stateTag(ASSETS.state[index]), ...mark, ...(told ? [el("small", {}, told)] : []));
     }
     return el("td", { class: kind, title: column.key === "category" ? column.text(index) : null }, column.text(index));
   }
