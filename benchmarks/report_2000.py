@@ -29,7 +29,7 @@ from slatprep.parameters import StoreParameters
 from slatprep.store import open_store
 from slatprep.store.integrity import open_for_writing
 from slatprep.store.layout import ARRAYS, RECORD_ARRAY
-from slatprep.store.records import manifests_of
+from slatprep.store.records import found_manifests, manifests_of
 from slatprep.store.writer import create_store
 
 RUNS = 3
@@ -58,11 +58,10 @@ document.querySelector('tbody tr:not(.space)').click();
 
 def records_of(store: Path) -> Path:
     """Return the folder of a store's records, where `slatprep report` looks for it too."""
-    usual = (manifests_of(store), Path("manifests/build") / store.stem)
-    for folder in usual:
-        if (folder / "assets.jsonl").is_file():
-            return folder
-    raise SystemExit(f"{store}: no records in {' or '.join(map(str, usual))}")
+    found = found_manifests(store, open_store(store).about.manifest)
+    if found is None:
+        raise SystemExit(f"{store}: no records of it found")
+    return Path(str(found))
 
 
 def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple[Path, Path]:

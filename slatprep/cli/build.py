@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -291,9 +292,21 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
             output.table("What would be done", ("asset", "action", "why"), rows)
         counts = ", ".join(f"{count:,} to {action}" for action, count in plan.actions.items())
         say(f"assets:  {len(plan.assets):,} ({counts})")
+        _say_removed(len(plan.taken_out), plan.taken_out, "is")
         say(f"store:   {plan.store} (a dry run: nothing is written)")
 
     output.result(vars(plan) | {"actions": plan.actions, "assets": assets}, show)
+
+
+def _say_removed(count: int, taken_out: Mapping[str, str], there: str) -> None:
+    """Print how many assets leave the store, which are the first, and why."""
+    if count:
+        named = [f"{name} ({why})" for name, why in islice(taken_out.items(), 3)]
+        more = f" and {count - 3:,} more" if count > 3 else ""
+        say(
+            f"removed: {amount(count, 'asset')} of the store that {there} there: "
+            f"{', '.join(named)}{more}"
+        )
 
 
 def report(output: Output, summary: BuildSummary) -> None:
@@ -340,8 +353,7 @@ def report(output: Output, summary: BuildSummary) -> None:
         say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
         if summary.unchanged:
             say(f"changed: nothing; {amount(good, 'asset')} reused")
-        if summary.removed:
-            say(f"removed: {amount(summary.removed, 'asset')} of the store that was there")
+        _say_removed(summary.removed, summary.taken_out, "was")
         if summary.store is not None:
             say(f"store:   {summary.store}")
         say(f"records: {summary.records}")

@@ -117,11 +117,11 @@ def _source_of_categories(overview: StoreOverview) -> str:
     """Say what gives a store the categories of its assets, as far as its records tell."""
     from slatprep.errors import StoreError
     from slatprep.storage.place import place_of
-    from slatprep.store.records import build_in, manifests_beside
+    from slatprep.store.records import build_in, found_manifests
 
     table, form = '"obj_ids_metadata.json"', ""
     try:
-        folder = manifests_beside(place_of(overview.store))
+        folder = found_manifests(place_of(overview.store), overview.build_id)
         parameters = None if folder is None else build_in(folder).parameters
     except StoreError:
         parameters = None
@@ -218,9 +218,10 @@ def report(
     slatprep report data/demo.zarr --out demo.html --manifests manifests/build/demo
     """
     from slatprep.inspect.report import write_report
+    from slatprep.store.records import found_manifests
 
     opened = options.opened(store)
-    records = manifests or options.records_of(opened.path)
+    records = manifests or found_manifests(opened.path, opened.about.manifest)
     if records is None:
         output.problem(
             f"no records of {store} found; the page cannot list assets that are not in the store. "

@@ -16,7 +16,7 @@ import click
 
 from slatprep.cli.output import Output, new_file
 from slatprep.cli.signature import Click, NewPath
-from slatprep.errors import StoreError, tally
+from slatprep.errors import tally
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -133,20 +133,6 @@ def chosen_store(store: Place | None) -> Place:
     if newest is None:
         raise click.UsageError("there is no store under data/; name one, or run `make align`")
     return newest
-
-
-def records_of(store: Place) -> Place | None:
-    """Return the folder of a store's records: beside it, or else where `make align` leaves them."""
-    from slatprep.store.records import build_in, manifests_beside
-
-    if (beside := manifests_beside(store)) is not None:
-        return beside
-    folder = Path("manifests/build") / store.name.removesuffix(".zarr")
-    try:
-        own = build_in(folder).id == opened(store).about.manifest
-    except (OSError, StoreError):
-        return None
-    return folder if own else None
 
 
 LastStore = Annotated[

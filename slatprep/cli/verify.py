@@ -70,7 +70,7 @@ def verify(
             sources=sources or roots is not None,
             roots=roots,
             sample=sample,
-            manifests=manifests or options.records_of(store),
+            manifests=manifests,
             jobs=jobs,
             progress=progress,
         )

@@ -29,6 +29,7 @@ from slatprep.pipeline.plan import (
     Note,
     PlannedAsset,
     plan_assets,
+    why_taken_out,
 )
 from slatprep.pipeline.publish import (
     BuildSummary,
@@ -233,9 +234,13 @@ def plan_build(
     pairs = _discover(parameters, jobs)
     before = look_back(place, pairs, wanted, crew, fresh, float(rehash))
     before.check(jobs)
+    place.there = before.previous
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
     plan = plan_assets(pairs, context, crew, before.known, ahead=True)
-    return BuildPlan(place.out, tuple(plan.values()), before.damaged)
+    refused = {one for one, planned in plan.items() if planned.action is Action.REFUSE}
+    gone = place.lost({pair.asset_id for pair in pairs} - refused)
+    taken_out = why_taken_out(gone, refused)
+    return BuildPlan(place.out, tuple(plan.values()), before.damaged, taken_out)
 
 
 def align_pairs(

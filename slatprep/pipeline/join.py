@@ -29,7 +29,7 @@ from slatprep.storage.documents import read_as
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
 from slatprep.store import Store, open_store
-from slatprep.store.records import build_in, manifests_beside
+from slatprep.store.records import build_in, found_manifests
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most
 
@@ -194,7 +194,7 @@ def _same_place(one: Place, other: Place) -> bool:
 
 def _places_of_sources(store: SourceStore) -> dict[str, Any]:
     """Return where a store's sources lay; nothing where no record beside it is of its build."""
-    folder = manifests_beside(store.path)
+    folder = found_manifests(store.path, store.about.manifest)
     with suppress(StoreError):  # The store does not need it, and `slatprep verify` names it.
         record = folder and build_in(folder)
         if record and record.id == store.about.manifest:

@@ -7,8 +7,8 @@ seen as they are.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from types import MappingProxyType
@@ -119,11 +119,13 @@ class BuildPlan:
     """What a build will do with the `assets`, sorted by id, to make or replace a `store`.
 
     `damaged` is what of the existing store is not as it was written, and will be made anew.
+    `taken_out` says by id why assets will leave it.
     """
 
     store: Place
     assets: tuple[PlannedAsset, ...]
     damaged: tuple[str, ...] = ()
+    taken_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def actions(self) -> dict[str, int]:
@@ -165,9 +167,14 @@ def plan_assets(
     gone = set(() if context.previous is None else context.previous.ids) - {
         one.asset_id for one in pairs
     }
-    why = "no longer among the sources"
-    plan |= {asset_id: PlannedAsset(asset_id, Action.REMOVE, why) for asset_id in gone}
+    plan |= {one: PlannedAsset(one, Action.REMOVE, why) for one, why in why_taken_out(gone).items()}
     return dict(sorted(plan.items()))
+
+
+def why_taken_out(removed: Iterable[str], refused: Collection[str] = ()) -> dict[str, str]:
+    """Say by id why assets leave a store; the `refused` are in the dataset still."""
+    why = "no longer in the dataset"
+    return {one: "cannot be used now" if one in refused else why for one in removed}
 
 
 def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:

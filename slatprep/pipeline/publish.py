@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.plan import why_taken_out
 from slatprep.records import Normalization, Place, Status
 from slatprep.storage.atomic import replace_directory
 from slatprep.storage.faults import reached
@@ -58,10 +59,10 @@ class Destination:
     """Where a store and its records go; `store` is where it really lies, behind a link.
 
     `out` is the store as its user names it, `manifests` the folder of its records, if not beside
-    it. `there` is the store that is there, where it is open already; `removed` is how many of its
-    assets the new one lacks. StoreError if there is something other than a store, or the folder
-    holds files of other origin or the records of another store; ConfigError if it lies in another
-    store.
+    it. `there` is the store that is there, where it is open already; `removed` are those of its
+    assets that the new one lacks. StoreError if there is something other than a store, or the
+    folder holds files of other origin or the records of another store; ConfigError if it lies in
+    another store.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
@@ -84,7 +85,7 @@ class Destination:
         self._upload: Upload | None = None
         self.there: Store | None = None
         self.replacing = False
-        self.removed = 0
+        self.removed: list[str] = []
 
     def look(self) -> None:
         """See, on an object store, what is published; raise `StoreError` if none may be there."""
@@ -108,13 +109,18 @@ class Destination:
         `staged` is what of it is on the object store already.
         """
         self.replacing = True
-        with suppress(StoreError):  # There was none, or its ids cannot be read.
-            self.removed = len(set((self.there or open_store(self.store)).ids) - set(ids))
+        self.removed = self.lost(ids)
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)
         elif (path := storage_of(self.store).local) is not None:
             replace_directory(new, path)
         reached("store replaced", str(self.store))
+
+    def lost(self, ids: Iterable[str]) -> list[str]:
+        """Return which assets of the store that is there are not among these, by id."""
+        with suppress(StoreError):  # There is none, or its ids cannot be read.
+            return sorted(set((self.there or open_store(self.store)).ids).difference(ids))
+        return []
 
     def publish(self) -> None:
         """Make the new version on an object store the current one."""
@@ -248,6 +254,8 @@ class BuildSummary:
         What the share of unchanged sources was drawn with that was hashed; None if none was.
     removed : int
         Assets of the store that was there which the new one lacks.
+    taken_out : dict of str to str
+        Why, by id, of the first `PROBLEMS_LISTED` of them.
     unchanged : bool
         Whether the store that was there stayed as it was.
     """
@@ -269,6 +277,7 @@ class BuildSummary:
     warnings: tuple[str, ...] = ()
     rehash_seed: int | None = None
     removed: int = 0
+    taken_out: Mapping[str, str] = field(default_factory=dict)
     unchanged: bool = False
 
     @property
@@ -339,7 +348,8 @@ def publish_build(
         build_id=store.about.manifest,
         store=place.out,
         normalization=store.normalization,
-        removed=place.removed,
+        removed=len(place.removed),
+        taken_out=why_taken_out(place.removed[:PROBLEMS_LISTED], {one.asset_id for one in failed}),
         unchanged=not place.replacing,
         **told,
     )

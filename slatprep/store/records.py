@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from slatprep.errors import StoreError
@@ -122,9 +123,18 @@ def manifests_of(store: Place) -> Place:
     return store.parent / f"{store.name.removesuffix('.zarr')}.manifests"
 
 
-def manifests_beside(store: Place) -> Place | None:
-    """Return the folder of a store's records if there is one; StoreError if nobody can tell."""
+def found_manifests(store: Place, build: str) -> Place | None:
+    """Return the folder of a store's records, None where there is none.
+
+    Beside the store, or where `make align` leaves them: the one that is of the store's `build`;
+    else what lies beside it. StoreError if nobody can tell.
+    """
+    named = store.parent.parent if is_version(store) else store
     folder = manifests_of(store)
+    for one in (folder, Path("manifests/build") / named.name.removesuffix(".zarr")):
+        with suppress(StoreError):
+            if build_in(one).id == build:
+                return one
     files = (folder / BUILD, folder / ASSETS)
     try:
         return folder if any(file.exists() for file in files) else None

@@ -305,3 +305,17 @@ def test_records_that_make_left_are_found(mixed_build, deformed_build, tmp_path,
     shutil.copytree(deformed_build.records.parent, "manifests/build/demo")
     assert "records: none beside the store" in run("verify", store).output
     assert "no records of data/demo.zarr found" in run("report", store).output
+
+
+def test_records_of_the_store_s_build_are_taken_and_other_ones_named(
+    mixed_build, deformed_build, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    store = Path(shutil.copytree(str(mixed_build.store), "data/demo.zarr"))
+    shutil.copytree(deformed_build.records.parent, "data/demo.manifests")
+    for command in ("verify", "report"):
+        said = " ".join(run(command, store, code=1).output.split())
+        assert "records with --manifests, or build again" in said
+    shutil.copytree(mixed_build.records.parent, "manifests/build/demo")
+    assert "records: manifests/build/demo" in run("verify", store).output
+    assert "page:" in run("report", store).output

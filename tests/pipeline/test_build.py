@@ -11,7 +11,7 @@ from slatprep.errors import ConfigError, InputError, MissingPartnerError, StoreE
 from slatprep.inspect.verify import verify_store
 from slatprep.pipeline.dataset import align_pairs, build_store, plan_build
 from slatprep.store import open_store
-from slatprep.store.records import build_in, manifests_beside
+from slatprep.store.records import build_in, manifests_of
 
 
 def test_bad_assets_are_told_and_the_others_go_in(mixed_build):
@@ -138,7 +138,7 @@ def test_a_link_stays_a_link_and_the_records_lie_where_the_store_does(make_datas
         summary = build_store(dataset.parameters(), link)
         assert link.is_symlink() and verify_store(link).ok
         assert sorted(path.name for path in disk.iterdir()) == ["real.manifests", "real.zarr"]
-        assert summary.records.parent == manifests_beside(link) == disk / "real.manifests"
+        assert summary.records.parent == manifests_of(link) == disk / "real.manifests"
         assert build_in(disk / "real.manifests").store == "real.zarr"
         assert not list(tmp_path.glob("*.manifests"))
 

@@ -128,7 +128,7 @@ def stiffer(dataset: Dataset) -> None:
 UPDATES = {
     "new and last": (lambda dataset: dataset.add("h", 1), {"h": "not in the store"}, "", 9),
     "other latents": (lambda data: data.change_slat("c"), {"c": "sources changed: slat"}, "", 4),
-    "removed": (lambda dataset: dataset.remove("e"), {"e": "no longer among the sources"}, "", 4),
+    "removed": (lambda dataset: dataset.remove("e"), {"e": "no longer in the dataset"}, "", 4),
     "other ranges": (stiffer, {"h": "not in the store"}, "aceg", 0),
 }
 """By name: a change, what is said of it, the assets that are reused, the least shards that stay."""

@@ -55,13 +55,33 @@ def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     assert rows == [[name, "good"] for name in "abc"]
     (dataset.root / "slat" / "a.npz").unlink()
     less = run("build-store", *words, "--out", out, "--decoys", "0", code=1).stdout
-    assert "removed: 1 asset of the store that was there" in less and "changed" not in less
+    assert "removed: 1 asset of the store that was there: a (cannot be" in less
+    assert "changed" not in less
     other = out.with_name("other.zarr")
     assert "removed" not in run("subset", out, "--asset", "b", "--out", other).stdout
     said = run("subset", out, "--asset", "c", "--out", other).stdout
     assert "assets:  1 (1 built, 0 not built, 0 skipped)" in said and "removed: 1 asset" in said
     fresh = document("build-store", *words, "--out", other, "--fresh", code=1)
     assert (fresh["removed"], fresh["unchanged"]) == (0, False)
+
+
+def test_a_dry_run_counts_what_the_build_removes_and_both_say_why(built):
+    dataset, out = built
+    words = ("build-store", "--pixieverse", dataset.root / "pixieverse")
+    words += ("--slat", dataset.root / "slat", "--out", out, "--decoys", "0")
+    (dataset.root / "slat" / "a.npz").unlink()
+    for path in dataset.root.rglob("b*"):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    gone = "b (no longer in the dataset)"
+    said = f"there: a (cannot be used now), {gone}\n"
+    assert f"removed: 2 assets of the store that is {said}" in run(*words, "--dry-run").stdout
+    assert f"removed: 2 assets of the store that was {said}" in run(*words, code=1).stdout
+    grid = next(dataset.root.glob("pixieverse/**/c*/**/*.npy"))
+    grid.write_bytes(grid.read_bytes()[:-100])
+    dataset.add("d", seed=3)
+    broken = document(*words, code=1)
+    assert broken["taken_out"] == {"c": "cannot be used now"}
+    assert any("truncated" in one[1] for one in broken["problems"] if one[0] == "c")
 
 
 def test_other_shards_need_no_alignment(built, aligned):

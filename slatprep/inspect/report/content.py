@@ -68,7 +68,8 @@ def build_of(manifests: Place, store: Store, most_absent: int) -> BuildRecord:
     if build.id != store.about.manifest:
         raise StoreError(
             f"{manifests} holds the records of build {build.id[:12]!r}, the store was written by "
-            f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests"
+            f"{store.about.manifest[:12]!r}; name the folder of its own records with --manifests, "
+            "or build again"
         )
     absent = sorted(build.failed[:most_absent], key=lambda one: one.asset_id)
     return replace(build, failed=tuple(absent))

@@ -27,7 +27,7 @@ from slatprep.store.attributes import segments_of
 from slatprep.store.contract import MAX_VOXELS, Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.reader import Store, open_store
-from slatprep.store.records import manifests_beside
+from slatprep.store.records import found_manifests
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
@@ -152,7 +152,7 @@ def verify_store(
             raise
         finding = Finding("zarr.json", "", str(error), "the metadata of a slatprep store")
         return Verification(path, 0, 0, 0, None, (finding,))
-    folder = manifests or manifests_beside(path)
+    folder = manifests or found_manifests(path, store.about.manifest)
     if sources:
         roots = source_roots(folder) if roots is None else moved(roots, folder)
     needed = [roots.slat, *(one.pixieverse for one in (roots, *roots.also))] if roots else []

@@ -25,6 +25,8 @@ from slatprep.store.records import BUILD, build_in, build_text, file_names, line
 
 _MOST_LINES = 8
 
+_OWN = "the store's: name the folder of its records with --manifests, or build again"
+
 
 def source_roots(manifests: Place | None) -> SourceRoots:
     """Return the roots of the sources when the store was built.
@@ -97,13 +99,13 @@ def manifest_findings(
         yield from fault_findings(file, "", error)
         build_id = _stated_id(text)
         if build_id != manifest:
-            yield Finding(file, "", f"id is {build_id!r}", f"{manifest!r}, the store's")
+            yield Finding(file, "", f"id is {build_id!r}", f"{manifest!r}, {_OWN}")
             return
     except StoreError as error:
         yield Finding(file, "", str(error), "the record of the build")
     else:
         if build.id != manifest:
-            yield Finding(file, "", f"id is {build.id!r}", f"{manifest!r}, the store's")
+            yield Finding(file, "", f"id is {build.id!r}", f"{manifest!r}, {_OWN}")
             return
         try:
             claims = [claim for claim in _claims(build, store) if claim[1] != claim[2]]
