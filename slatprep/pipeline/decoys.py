@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from slatprep.errors import SlatprepError, StoreError, amount
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.plan import Crew
 from slatprep.pipeline.publish import is_marked
-from slatprep.pipeline.rows import SourceStore
+from slatprep.pipeline.rows import SourceStore, slat_contents
 from slatprep.records import Engine, Number, Place, Share, Verdict
 from slatprep.storage.atomic import writing
 from slatprep.storage.documents import read_as, read_bounded
@@ -223,8 +223,10 @@ def measure_errors(
     if reason := _no_decoys(store):
         raise StoreError(f"{store.path}: {reason}")
     writable_file(store.path)
-    keys, evidence = _evidence_of(store)
-    wanted = draw_decoys(store, keys, decoys, seed)
+    keys, grids, evidence = _evidence_of(store)
+    wanted = draw_decoys(store, keys, grids, decoys, seed)
+    if not wanted:
+        raise StoreError(f"{store.path}: decoys need two objects that share neither grid nor SLAT")
     measured = before or measured_errors(store.path)
     known = {(one.grid, one.slat, one.keys): one for one in measured.decoys} if measured else {}
     found = [known.get((one.grid, one.slat, one.keys), one) for one in wanted]
@@ -298,16 +300,19 @@ def _no_decoys(store: Store) -> str:
     return ""
 
 
-def _evidence_of(store: Store) -> tuple[dict[str, str], NDArray[np.float64]]:
-    """Return the key of each asset by its id, and the evidence (A, F), from the records."""
+def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.float64]]:
+    """Return from the records: keys by id, digests of grids by row, the evidence (A, F)."""
     records = StoredRecords(store)
     keys: dict[str, str] = {}
+    grids: list[str] = []
     evidence: list[NDArray[np.float64]] = []
     for row, asset_id in enumerate(store.ids):
-        # To check a whole record takes a millisecond, and only these two are needed.
+        # To check a whole record takes a millisecond, and only these are needed.
         try:
             record = orjson.loads(records.text(row))
             keys[asset_id] = str(record["key"])
+            own = (file["sha256"] for file in record["sources"] if file["role"] == "grid")
+            grids.append(next(own, ""))
             evidence.append(np.array(record["judgement"]["evidence"], dtype=np.float64))
         except (ValueError, KeyError, TypeError):
             raise StoreError(
@@ -315,23 +320,34 @@ def _evidence_of(store: Store) -> tuple[dict[str, str], NDArray[np.float64]]:
             ) from None
     if len({one.shape for one in evidence}) != 1 or not evidence[0].size:
         raise StoreError(f"{store.path}: its records hold no evidence; build it again")
-    return keys, np.array(evidence)
+    return keys, grids, np.array(evidence)
 
 
-def draw_decoys(store: Store, keys: Mapping[str, str], count: int, seed: int) -> list[Decoy]:
-    """Choose grids by a hash of their ids, and for each the SLAT of the size nearest to its own."""
+def draw_decoys(
+    store: Store, keys: Mapping[str, str], grids: Sequence[str], count: int, seed: int
+) -> list[Decoy]:
+    """Choose grids by a hash of their ids, and for each the SLAT of the size nearest to its own.
+
+    It is another object's: neither its own SLAT, nor one whose grid is the same file, by the
+    digests of `grids`, where they are known.
+    """
     ids, objects = store.ids, [str(one) for one in store.column("object_id")]
     sizes = np.diff(store.offsets).tolist()
     by_hash = sorted(range(len(ids)), key=lambda row: _hash(seed, ids[row]))
     # Stable, so that of one size the order is that of the hashes.
     by_size = sorted(by_hash, key=sizes.__getitem__)
     place = {row: at for at, row in enumerate(by_size)}
+    contents: list[Sequence[object]] = [objects, slat_contents(store), grids]
     drawn = []
     for row in by_hash[:count]:
-        at, own = place[row], objects[row]
+        at = place[row]
         smaller = (by_size[k] for k in range(at - 1, -1, -1))
         larger = (by_size[k] for k in range(at + 1, len(by_size)))
-        firsts = (next((k for k in side if objects[k] != own), None) for side in (smaller, larger))
+        alike = [(column, column[row]) for column in contents if column[row]]
+        firsts = (
+            next((k for k in side if all(column[k] != own for column, own in alike)), None)
+            for side in (smaller, larger)
+        )
         near = [k for k in firsts if k is not None]
         if near:
             other = min(near, key=lambda k: abs(sizes[k] - sizes[row]))

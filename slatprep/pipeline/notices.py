@@ -12,7 +12,7 @@ from slatprep.align.consensus import find_consensus
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
-from slatprep.pipeline.rows import NextStore, moments_of
+from slatprep.pipeline.rows import NextStore, moments_of, slat_contents
 from slatprep.readers.contents import in_words, look_standardised, pooled_moments
 from slatprep.readers.joins import explain_unmatched
 from slatprep.readers.plausible import ENOUGH
@@ -61,7 +61,9 @@ def dataset_notices(
         yield from shared_rotation(new)
     made = {row.asset_id: str(row.columns["unusual"]) for row in new.rows if row.spooled}
     yield from unusual_sources(made, failed)
-    yield from shared_sources(new)
+    yield from shared_sources(new, "SLAT", slat_contents(new))
+    # Of rows that lie in another store, no column tells the grid.
+    yield from shared_sources(new, "grid", [row.columns.get("grid") for row in new.rows])
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
         yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
 
@@ -106,7 +108,8 @@ def unusual_sources(told: Mapping[str, str], failed: Sequence[FailedRecord] = ()
 def stored_oddities(store: Store) -> list[str]:
     """Say what is unusual of the sources of all assets of a store, and what of it was clipped."""
     told = dict(zip(store.ids, store.column("unusual"), strict=True))
-    return [*unusual_sources(told), *much_clipped(store)]
+    shared = shared_sources(store, "SLAT", slat_contents(store))
+    return [*unusual_sources(told), *shared, *much_clipped(store)]
 
 
 def shared_rotation(new: NextStore) -> Iterator[str]:
@@ -123,25 +126,22 @@ def shared_rotation(new: NextStore) -> Iterator[str]:
         )
 
 
-def shared_sources(new: NextStore) -> Iterator[str]:
-    """Yield which objects have one SLAT, and which new ones have one grid, by their content."""
-    slats: defaultdict[object, list[int]] = defaultdict(list)
-    grids: defaultdict[object, list[int]] = defaultdict(list)
-    moments = moments_of(new.rows, new.stores)
-    for at, row in enumerate(new.rows):
-        if moments[at]:
-            slats[row.n_voxels, moments[at]].append(at)
-        if row.spooled:
-            grids[row.columns["grid"]].append(at)
-    objects = new.column("object_id")
-    for what, found in (("SLAT", slats), ("grid", grids)):
-        groups = [own for own in found.values() if len({objects[at] for at in own}) > 1]
-        if groups:
-            names = [" = ".join(new.rows[at].asset_id for at in own[:4]) for own in groups]
-            yield (
-                f"{sum(map(len, groups))} assets of different objects have one {what} "
-                f"({_first(names)}): see whether a map or a copy gave it to both"
-            )
+def shared_sources(
+    store: NextStore | Store, what: str, contents: Sequence[object]
+) -> Iterator[str]:
+    """Yield which objects have one source, by its content; empty where it is not known."""
+    found: defaultdict[object, list[int]] = defaultdict(list)
+    for at, content in enumerate(contents):
+        if content:
+            found[content].append(at)
+    ids, objects = store.ids, store.column("object_id")
+    groups = [own for own in found.values() if len({objects[at] for at in own}) > 1]
+    if groups:
+        names = [" = ".join(ids[at] for at in own[:4]) for own in groups]
+        yield (
+            f"{sum(map(len, groups))} assets of different objects have one {what} "
+            f"({_first(names)}): see whether a map or a copy gave it to both"
+        )
 
 
 def wild_ranges(

@@ -201,6 +201,16 @@ def moments_of(rows: Sequence[Row], stores: Sequence[SourceStore]) -> list[Laten
     ]
 
 
+def slat_contents(store: NextStore | Store) -> list[bytes]:
+    """Return what tells the SLAT of each row from others, its size and moments; empty if unknown.
+
+    A digest of its file would not: a file may hold those of all assets.
+    """
+    means, stds = store.column("latent_mean"), store.column("latent_std")
+    told = np.column_stack([np.diff(store.offsets), means, stds])
+    return [b"" if np.isnan(own[-1]) else own.tobytes() for own in told]
+
+
 @dataclass(frozen=True, eq=False)
 class NextStore:
     """A store that is to be written.

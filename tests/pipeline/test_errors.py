@@ -40,16 +40,34 @@ def test_decoys_are_of_other_objects_and_are_aligned_once(store):
 
 
 def test_decoys_are_drawn_by_ids_and_seed_with_the_slat_of_the_nearest_size(store):
-    keys = dict.fromkeys(store.ids, "")
-    few, more, drawn = (draw_decoys(store, keys, count, 1) for count in (2, 4, 100))
+    keys, grids = dict.fromkeys(store.ids, ""), [""] * len(store)
+    few, more, drawn = (draw_decoys(store, keys, grids, count, 1) for count in (2, 4, 100))
     assert drawn[:4] == more and more[:2] == few
-    assert [one.grid for one in draw_decoys(store, keys, 100, 2)] != [one.grid for one in drawn]
+    assert [one.grid for one in draw_decoys(store, keys, grids, 100, 2)] != [
+        one.grid for one in drawn
+    ]
     sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
     objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
     for one in drawn:
         others = [other for other in store.ids if objects[other] != objects[one.grid]]
         nearest = min(abs(sizes[other] - sizes[one.grid]) for other in others)
         assert abs(sizes[one.slat] - sizes[one.grid]) == nearest
+
+
+def test_pairs_that_share_a_slat_or_a_grid_are_no_decoys(make_dataset, tmp_path):
+    dataset, out = make_dataset("a", "b", "c", "d"), tmp_path / "s.zarr"
+    slats, grid = dataset.root / "slat", dataset.assets["c"].grid
+    (slats / "b.npz").write_bytes((slats / "a.npz").read_bytes())
+    dataset.write_grid("d", grid)
+    build_store(dataset.parameters(), out)
+    pairs = {(one.grid, one.slat) for one in measure_errors(open_store(out), decoys=9).decoys}
+    assert len(pairs) == 4
+    assert not pairs & {("a", "b"), ("b", "a"), ("c", "d"), ("d", "c")}
+    shared = "have one SLAT (a = b)"
+    assert shared in run("info", out).output and shared in run("list", out).output
+    run("subset", out, "--asset", "a", "--asset", "b", "--out", tmp_path / "two.zarr")
+    said = run("measure-errors", tmp_path / "two.zarr", code=1).output
+    assert "decoys need two objects that share neither grid nor SLAT" in said
 
 
 def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
