@@ -135,7 +135,7 @@ def _target(store: Place, picture: Path | None, assets: int) -> Path | None:
     if picture.suffix.lower() not in allowed and not picture.is_dir():
         raise click.UsageError(
             f"--picture {picture}: expected a file that ends in .{', .'.join(FORMATS)}, a folder "
-            "without a suffix or with .pictures, or none"
+            "without a suffix or with .pictures, or the word none"
         )
     if assets > 1 and picture.suffix.lower()[1:] in FORMATS:
         raise click.UsageError(f"--picture {picture} is one file; {assets} assets need a folder")

@@ -159,8 +159,8 @@ class MeasuredErrors:
             return [
                 f"likely at most {math.ceil(high):,} of the {self.good:,} called good show another "
                 f"object, and at most {shares[1]:.1%} of all assets",
-                f"{amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')} tell no "
-                f"more; {LEAST_DECOYS} decoys and {LEAST_TARGETS} assets tell how many it is about",
+                f"measured on {amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')}"
+                f"; an estimate needs at least {LEAST_DECOYS} decoys and {LEAST_TARGETS} assets",
             ]
         return [
             f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "

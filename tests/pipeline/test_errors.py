@@ -78,7 +78,7 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
     assert few.sentences() == [
         f"likely at most 1 of the 4 called good show another object, "
         f"and at most {found.wrong_share_range[1]:.1%} of all assets",
-        "3 decoys of 5 assets tell no more; 40 decoys and 50 assets tell how many it is about",
+        "measured on 3 decoys of 5 assets; an estimate needs at least 40 decoys and 50 assets",
     ]
     enough = replace(few, refitted=True)
     assert "about 0 show another object (0 to 0; measured on 3 decoys" in enough.sentences()[0]
