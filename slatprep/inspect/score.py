@@ -88,12 +88,12 @@ class TruthScore:
         looked up in the PixieVerse frame and where they truly lie.
     label_accuracy : float
         Share of the answerable voxels whose class is right (of a store without
-        classes, all of whose properties are); a voxel without a label is wrong.
+        classes, all of whose properties are); one that is not valid is wrong.
     truth_own : float
         The same share for the annotated voxel nearest to each true place: what
         is left to lose by the lookup alone.
     valid_share : float
-        Share of the SLAT voxels that carry a label.
+        Share of the SLAT voxels that are valid.
     similarity_displacement, similarity_accuracy : float
         Displacement and share of right classes of the truth's transform: of the
         similarity that comes nearest to the true places.
