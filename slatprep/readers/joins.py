@@ -7,7 +7,9 @@ import io
 import json
 import re
 from collections.abc import Collection, Iterable
+from functools import partial
 from itertools import chain
+from typing import TextIO
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters
@@ -17,6 +19,9 @@ from slatprep.storage.place import storage_of
 
 MAX_JSON_BYTES = 256 * 2**20
 """No list of categories is larger; one of 500,000 objects takes 50 MB."""
+
+_LONGEST_LINE = 2**24
+"""Letters of a line of a map of ids; TRELLIS's captions take some thousand."""
 
 _FORMS = (("object_id", "slat_id"), ("file_identifier", "sha256"))
 """Columns that name objects and SLATs: of our own tables, and of TRELLIS's."""
@@ -37,7 +42,7 @@ def read_map(
     claims: dict[str, dict[tuple[str, str], None]] = {}
     try:
         with io.TextIOWrapper(storage_of(path).open(), "utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file)
+            reader = csv.DictReader(iter(partial(_line_of, file), ""))
             columns = set(reader.fieldnames or ())
             for name in ("view", *chain.from_iterable(_FORMS)):
                 if (reader.fieldnames or ()).count(name) > 1:
@@ -64,6 +69,14 @@ def read_map(
         reason = "save it as CSV in UTF-8" if isinstance(error, UnicodeDecodeError) else error
         raise ConfigError(f"{path}: cannot be read as a map of ids ({reason})") from None
     return {object_id: list(named) for object_id, named in claims.items()}
+
+
+def _line_of(file: TextIO) -> str:
+    """Return the next line, and not a file without lines as one."""
+    line = file.readline(_LONGEST_LINE)
+    if len(line) == _LONGEST_LINE:
+        raise csv.Error(f"a line has more than {_LONGEST_LINE:,} letters")
+    return line
 
 
 def read_categories(path: Place) -> dict[str, str]:

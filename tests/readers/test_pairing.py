@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -344,6 +345,17 @@ def test_a_pipe_in_place_of_a_table_is_not_waited_for(find, tmp_path, key):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ConfigError, match=r"pipe: cannot be read as .*no regular file"):
         find([grid("a")], ["a.npz"], **{key: tmp_path / "pipe"})
+
+
+def test_a_map_without_lines_does_not_fill_the_memory(find, tmp_path):
+    table = tmp_path / "map.csv"
+    table.touch()
+    os.truncate(table, 2**30)
+    tracemalloc.start()
+    with pytest.raises(ConfigError, match=r"map\.csv: cannot be read as .*more than 16,777,216"):
+        find([grid("a")], ["a.npz"], map=table)
+    assert tracemalloc.get_traced_memory()[1] < 2**28
+    tracemalloc.stop()
 
 
 def test_a_list_of_categories_beyond_reason_is_not_read(find, tmp_path):
