@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -23,14 +24,19 @@ def in_unicode(text: str) -> str:
 def printable(text: str) -> str:
     r"""Return text with control characters written as JSON escapes.
 
-    Names and categories are not trusted. Line breaks and tabs are kept.
+    Names and categories are not trusted. Line breaks, tabs, spaces of any width, and what joins
+    letters or parts them, are kept.
 
     >>> print(printable("cup" + chr(27) + "[2J"))
     cup\u001b[2J
     """
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in "\n\t" else _escaped(c) for c in text)
+    return "".join(c if _is_harmless(c) else _escaped(c) for c in text)
+
+
+def _is_harmless(c: str) -> bool:
+    return c.isprintable() or c in "\n\t\u200c\u200d" or unicodedata.category(c) == "Zs"
 
 
 def _escaped(character: str) -> str:

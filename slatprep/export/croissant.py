@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import date
+from datetime import datetime
 from typing import Any
 
 from slatprep.errors import ConfigError, StoreError, printable
@@ -61,7 +61,7 @@ class Stated:
     license : str
         An SPDX identifier, such as ``CC-BY-4.0``, or the URL of a licence.
     date_published : str
-        Year, month and day, as ``2026-01-31``.
+        Year, month and day, as ``2026-01-31``; a time may follow.
     """
 
     name: str = ""
@@ -97,7 +97,7 @@ class Stated:
 
 def _is_day(text: str) -> bool:
     try:
-        return date.fromisoformat(text).isoformat() == text
+        return datetime.fromisoformat(text).date().isoformat() == text[:10]
     except ValueError:
         return False
 

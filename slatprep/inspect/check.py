@@ -7,6 +7,7 @@ import math
 import operator
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ voxels.
 FITNESS = ("fitness", "fitness_backward")
 """Shares of either side's boundary that are near the other's."""
 
+_PROBABILITIES = ("same_object", "right_placement", "expected_accuracy")
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
 LIMITS = {
@@ -164,9 +166,15 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     radius = store.about.build.parameters.align.radius
     valid_share, differs = recompute_annotation(asset)
     record = StoredRecords(store).read(asset.index)
-    alignment, judgement = record.alignment, record.judgement
+    alignment, columns = record.alignment, asset.columns
+    # As the columns have it: they are what is looked at.
+    stated = {name: float(columns[name]) for name in _PROBABILITIES}
+    ambiguity = replace(record.judgement.ambiguity, material_share=float(columns["ambiguity"]))
+    contradicted = bool(columns["contradicted"])
+    judgement = replace(
+        record.judgement, ambiguity=ambiguity, contradicted=contradicted, **cast(Any, stated)
+    )
     quality = measure_quality(asset.field, asset.latents, asset.transform, radius, alignment.ground)
-    columns = asset.columns
     figures = [
         Figure(name, getattr(quality, name), float(columns[name]), QUALITY_TOLERANCE)
         for name in _QUALITY

@@ -142,7 +142,7 @@ def _validated(kind: type[_Group], data: Mapping[str, Any], origin: _Origin) -> 
 
 
 def _plain(value: object) -> object:
-    return value.item() if isinstance(value, np.generic) else str(value)
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 class _Origin(NamedTuple):

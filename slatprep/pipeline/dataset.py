@@ -56,6 +56,10 @@ from slatprep.workers.local import Jobs, require_shared, run_unordered, start_ea
 __all__ = ["BuildPlan", "BuildSummary", "Progress", "align_pairs", "build_store", "plan_build"]
 
 
+_BROUGHT_ABOUT = (OSError, ArithmeticError, ValueError, MemoryError, RuntimeError)
+"""Errors that data and machines bring about, and no fault of slatprep's own."""
+
+
 def build_store(
     parameters: BuildParameters,
     out: str | Place,
@@ -163,8 +167,8 @@ def build_store(
             aligned = sum(plan[one].action is not Action.REUSE for one in new.ids)
             try:
                 measure_build(place.in_place(), aligned, decoys, crew, before.previous)
-            except (SlatprepError, OSError, ArithmeticError, ValueError, MemoryError) as error:
-                # What data and machines bring about; the store is published, and stays so.
+            except (*_BROUGHT_ABOUT, SlatprepError) as error:
+                # The store is published, and stays so.
                 told = f"errors were not measured ({error}); run `slatprep measure-errors`"
                 summary = replace(summary, warnings=(*summary.warnings, told))
     return summary

@@ -80,7 +80,7 @@ def subset_store(
     StoreError
         If the store lacks an asset, or cannot be read, or the disk does not take the new one.
     """
-    source = SourceStore(open_store(store))
+    source = _source(store)
     everything = _rows([source])
     chosen = {source.match(name) for name in words_of(assets)}
     rows = in_order([everything[row] for row in chosen], None, compact=True)
@@ -126,7 +126,7 @@ def concat_stores(
     StoreError
         If one cannot be read, or the disk does not take the new one.
     """
-    sources = [SourceStore(open_store(store)) for store in stores]
+    sources = [_source(store) for store in stores]
     if len(sources) < 2:
         raise ConfigError(f"{len(sources)} stores to join; expected two or more")
     rows = _rows(sources)
@@ -142,6 +142,11 @@ def concat_stores(
     how = _common_ranges(sources), contents, build, parameters.store
     rows = in_order(rows, None, compact=True)
     return _write(NextStore(rows, tuple(sources), *how), parameters, place, jobs, progress)
+
+
+def _source(store: Store | str | Place) -> SourceStore:
+    # Anew, as workers do: what an open store has read may be of one that was replaced since.
+    return SourceStore(open_store(open_store(store).path))
 
 
 def _rows(sources: Sequence[SourceStore]) -> list[Row]:

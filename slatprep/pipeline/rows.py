@@ -48,7 +48,7 @@ class SourceStore(Store):
     def __init__(self, store: Store, damaged: frozenset[str] = frozenset()) -> None:
         vars(self).update(vars(store))  # What was read of it is not read again.
         self.damaged = damaged
-        # Not of itself: files of what holds itself stay open until garbage is collected.
+        # `StoredRecords(self)` would be a circle, whose files stay open until it is collected.
         self.records = StoredRecords(store)
         # A process that lives on must not answer with what it read of an older store at the same
         # path, whose rows may have been in another order under the same id.

@@ -32,6 +32,7 @@ def field_of_voxels(
     frame: NDArray[np.float64] | None = None,
     names: Sequence[str] = (),
     roots: records.SourceRoots | None = None,
+    description: str = "",
 ) -> records.MaterialField:
     """Make a field of annotated voxels (K, 3): integers in 0..resolution - 1, or float points.
 
@@ -43,13 +44,14 @@ def field_of_voxels(
     voxels' most frequent class (the lowest at a tie) and mean properties, in log10 where the
     normalisation is. InputError if there is no voxel, one is out of range, or too many are
     unphysical. `names` are those of the classes; `roots` say which units the values have, and
-    what becomes of implausible ones.
+    what becomes of implausible ones. Where a file `description` states the resolution, integers are
+    voxels as they are in the source: each once, and in all of the grid.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
-    count, whole = len(cells), np.asarray(voxels).dtype.kind != "f"
-    notes: list[str] = []
-    if whole:
-        notes += low_places(cells, resolution, "say the grid's own resolution in source.json")
+    count, notes = len(cells), list[str]()
+    once = bool(description) and np.asarray(voxels).dtype.kind != "f"
+    if once and (roots is None or roots.plausibility != "off"):
+        notes += low_places(cells, resolution, f"say the grid's own resolution in {description}")
     given = np.zeros(count, np.int64) if material is None else np.asarray(material)
     with np.errstate(invalid="ignore"):
         own = given.astype(np.int64)
@@ -75,8 +77,9 @@ def field_of_voxels(
     flat = flat_index(cells, side)
     cell, labels, means = _merged(flat[keep], own[keep], values[keep], table)
     if len(cell) < np.count_nonzero(keep):
-        if whole:
-            _require_alike(where, flat_index(index, resolution), own, values)
+        if once:
+            own_cells = flat_index(index, resolution)
+            _require_alike(where, np.flatnonzero(keep), own_cells, own, values)
         notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(cell)} of {side}^3")
     there = np.full(side**3, -1, dtype=np.int64)
     there[flat] = len(cell)  # occupied at least
@@ -153,18 +156,20 @@ def physical_rows(
 
 def _require_alike(
     where: str | records.Place,
+    rows: NDArray[np.intp],
     flat: NDArray[np.int64],
     classes: NDArray[np.int64],
     values: NDArray[np.float32],
 ) -> None:
-    """Refuse a voxel that is given twice, with other classes or values."""
-    order = np.argsort(flat, kind="stable")
+    """Refuse a voxel that some rows give twice, with other classes or values."""
+    order = rows[np.argsort(flat[rows], kind="stable")]
     twice = np.flatnonzero(np.diff(flat[order]) == 0)
     first, second = order[twice], order[twice + 1]
-    other = (classes[first] != classes[second]) | (values[first] != values[second]).any(axis=1)
+    unlike = ~np.isclose(values[first], values[second], rtol=1e-3, atol=0.0)  # as float16 rounds
+    other = (classes[first] != classes[second]) | unlike.any(axis=1)
     if other.any():
-        rows = f"rows {first[other][0]} and {second[other][0]}"
-        fault = f"{rows} are of one voxel, and differ in class or properties"
+        both = f"rows {first[other][0]} and {second[other][0]}"
+        fault = f"{both} are of one voxel, and differ in class or properties"
         raise InputError(where, fault, "each voxel once; or points, as floats in the unit cube")
 
 

@@ -138,6 +138,7 @@ class PlainVoxels(SourceAdapter):
             frame=np.eye(4) if said.aligned else None,
             names=said.names,
             roots=pair.roots,
+            description=DESCRIPTION,
         )
 
 

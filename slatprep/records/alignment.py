@@ -264,7 +264,7 @@ class FitFigures:
         Root mean square second derivative of the displacement over the
         lattice [1 / voxel]; 0 without one.
     mirrored : float
-        Rise of the score once one side is mirrored: above `MIRRORED` the annotation is a
+        Rise of the score once one side is mirrored: above 0.025 the annotation is a
         mirror image of its object. NaN where the fit is too good for that, or where
         another engine placed it.
     clear_by : float

@@ -121,6 +121,8 @@ def test_no_category_is_a_control_character_or_the_row_of_all(copy):
         assert all(c.isprintable() or c == "\n" for c in made)
     assert "cup\\u001b" in card and '\n| "all" | 1 | ' in card and "\n| all | 5 | " in card
     assert json.loads(text)["recordSet"][-1]["data"][0]["assets/category"] == word
+    cited = "M\u00fcller, A.\u00a0B."
+    assert cited in card_of(store, Stated(name="a", cite_as=cited), "s.zarr", [])
 
 
 @pytest.mark.parametrize(("words", "said"), [
@@ -132,7 +134,8 @@ def test_no_category_is_a_control_character_or_the_row_of_all(copy):
 def test_what_is_stated_is_what_it_says(words, said, store, tmp_path):
     assert said in run(store, "--out", tmp_path / "hub", *words, code=2).stderr
     assert said in commands.refused("describe", store, *words)
-    commands.run("describe", store, "--date-published", "2026-01-31", "--url", "https://a.org/b")
+    for day in ("2026-01-31", "2026-01-31T12:00:00Z"):
+        commands.run("describe", store, "--date-published", day, "--url", "https://a.org/b")
 
 
 @pytest.fixture(scope="module")

@@ -196,6 +196,20 @@ def test_changed_voxels_a_changed_grid_and_a_changed_verdict_are_found(copy):
         check_alignment(store, "nobody")
 
 
+@pytest.mark.parametrize(("name", "value"), [
+    ("same_object", 0.1), ("right_placement", 0.1), ("expected_accuracy", 0.2),
+    ("contradicted", True), ("ambiguity", 0.9),
+])  # fmt: skip
+def test_a_verdict_that_its_columns_do_not_give_is_found(copy, name, value):
+    assert check_alignment(copy, 0).consistent
+    rewrite(copy, f"asset/{name}", 0, value)
+    found = check_alignment(copy, 0)
+    if name == "ambiguity":  # The record says that nothing ties.
+        assert found.value("ambiguity") == value
+    else:
+        assert not found.consistent and found.verdict != "good"
+
+
 def test_ground_does_not_count_now_either(make_dataset: MakeDataset, tmp_path):
     dataset = make_dataset("ant")
     grid = dataset.assets["ant"].grid

@@ -39,6 +39,16 @@ def test_a_subset_is_the_build_of_its_assets(folder, tmp_path):
     assert records_of(tmp_path / "s.manifests" / "assets.jsonl") == built
 
 
+def test_a_store_that_was_replaced_since_it_was_opened_is_read_anew(folder, tmp_path):
+    path = copied(folder / "abcd.zarr", tmp_path / "w.zarr")
+    opened = open_store(path)
+    assert opened.ids[0] == "a" and opened.columns_of(["density"])
+    shutil.rmtree(path)
+    shutil.copytree(folder / "bd.zarr", path)
+    subset_store(opened, tmp_path / "s.zarr", ["d", "b.s", "b.front"])
+    assert tree(tmp_path / "s.zarr") == tree(folder / "bd.zarr")
+
+
 @pytest.mark.parametrize("ranges", ["dataset", "p1-p99", "dataset of train"])
 def test_an_update_of_a_subset_has_the_ranges_of_its_own_dataset(make_dataset, tmp_path, ranges):
     dataset, out = make_dataset("a", "b"), tmp_path / "s.zarr"

@@ -138,6 +138,15 @@ def test_a_mask_that_contradicts_its_grid_is_told_or_refused(make_pair):
     with pytest.raises(InputError, match=r"mask\.npy: leaves out 70% of .*mask = \[\]") as caught:
         read_field(other)
     assert 'plausibility = "warn" there. Such keys hold for all objects' in str(caught.value)
+    few = np.roll(same, 1, axis=0)
+    assert "leaves out 10% of" in read_field(make_pair(grid=grid, mask=few)).warnings[-1]
+    unlabelled = changed(grid, (np.s_[20:24, 20:30, 20:30, 3], -1))
+    assert not any(
+        "unusual" in w for w in read_field(make_pair(grid=unlabelled, mask=same)).warnings
+    )
+    channels = np.moveaxis(changed(grid, (np.s_[..., :3], 0.5)), -1, 0).astype(np.float32)
+    predicted = read_field(make_pair(grid=channels, mask=np.roll(same, 7, axis=0)))
+    assert not any("unusual" in text for text in predicted.warnings)  # Any class may lie outside.
     part = same & np.roll(same, 7, axis=0)
     *_, told = read_field(make_pair(grid=grid, mask=part)).warnings
     assert "leaves out 70% of the voxels with a class, and 0% of it is" in told

@@ -164,6 +164,8 @@ def test_latents_that_no_encoder_gives_are_told(make_pair):
         (told,) = read_latents(make_pair(**whole | {"feats": odd})).warnings
         assert told.startswith(f"unusual latents: {said}")
     assert read_latents(make_pair(**whole | {"feats": changed(feats, (3, 0))})).warnings == ()
+    few = {name: rows[:20] for name, rows in (whole | {"feats": 0 * feats}).items()}
+    assert read_latents(make_pair(**few)).warnings == ()
 
 
 def test_missing_array_and_group(make_pair):
