@@ -42,6 +42,8 @@ _NEEDED = ("asset/id/", "asset/offset/", f"{RECORD_ARRAY}/zarr.json", "file")
 class SourceStore(Store):
     """An open store that assets are taken from; each process that gets one opens it once.
 
+    What the given store has read, and its open files, are shared with it.
+
     `damaged` are files of its records that are not as they were written.
     """
 

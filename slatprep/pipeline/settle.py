@@ -85,11 +85,11 @@ def kept_rows(
         rows.append(Row(planned.asset_id, sizes[row], store=0, row=row, names=names, seen=seen))
     everything = [*rows, *(asset for asset in made if isinstance(asset, Row))]
     if len(everything) == len(rows) == len(previous) and not any(row.names for row in rows):
-        # Whatever made ranges and placements of these assets would make the same again. Of a
-        # subset, or of joined stores, it was not a build of these assets.
-        told = wanted.ranges == "dataset" or isinstance(wanted.ranges, Normalization)
-        sure = before.built or (told and not wanted.passes)
-        return rows if sure and wanted.has_ranges(previous) else []
+        # A build of these assets would make the same again. A subset and joined stores have ranges
+        # and placements of other assets, but where the rows alone show that these are the same.
+        by_rows = wanted.ranges == "dataset" or isinstance(wanted.ranges, Normalization)
+        same = before.built or (by_rows and not wanted.passes)
+        return rows if same and wanted.has_ranges(previous) else []
     if wanted.passes:
         return []
     ranges = wanted.ranges
