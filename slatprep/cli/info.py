@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from slatprep.cli import options
-from slatprep.cli.output import Cell, Output, say, write_csv
+from slatprep.cli.output import Cell, Output, as_typed, say, write_csv
 from slatprep.cli.signature import Click, command
 from slatprep.errors import apart_from
 
@@ -48,7 +48,7 @@ def info(output: Output, store: options.LastStore) -> None:
             "engine": ", ".join(overview.engines),
             "model": ", ".join(overview.models),
         }
-        output.record(f"Store {overview.store}", contents)
+        output.record(f"Store {as_typed(overview.store)}", contents)
         show_quality(output, overview)
         show_errors(opened)
         show_unusual(unusual)
@@ -84,7 +84,7 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
     unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)
     if unknown and advise:
         say(f"unknown: the category of {unknown:,}; {_source_of_categories(overview)}")
-    store = overview.store
+    store = as_typed(overview.store)
     if not isinstance(store, Path) and is_version(store):  # It is gone two builds later.
         store = store.parent.parent
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]

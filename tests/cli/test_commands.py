@@ -168,7 +168,7 @@ def test_store_built_last_is_the_default(demo, monkeypatch):
     (elsewhere / "data" / "gone.zarr").symlink_to(demo / "gone.zarr")
     assert "make align" in refused("info")
     (elsewhere / "data" / "demo.zarr").symlink_to(demo / "demo.zarr")
-    run("info", "--json")
+    assert run("info").stdout.startswith("Store data/demo.zarr\n")
     words = ("check-alignment", "--asset", "0", "--picture", "none", "--json")
     last, store = run(*words).stdout, demo / "demo.zarr"
     assert run(*words, store).stdout == run(*words, "--store", store).stdout
