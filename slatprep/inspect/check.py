@@ -7,7 +7,6 @@ import math
 import operator
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,6 @@ voxels.
 FITNESS = ("fitness", "fitness_backward")
 """Shares of either side's boundary that are near the other's."""
 
-_PROBABILITIES = ("same_object", "right_placement", "expected_accuracy")
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
 LIMITS = {
@@ -168,11 +166,13 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     record = StoredRecords(store).read(asset.index)
     alignment, columns = record.alignment, asset.columns
     # As the columns have it: they are what is looked at.
-    stated = {name: float(columns[name]) for name in _PROBABILITIES}
-    ambiguity = replace(record.judgement.ambiguity, material_share=float(columns["ambiguity"]))
-    contradicted = bool(columns["contradicted"])
     judgement = replace(
-        record.judgement, ambiguity=ambiguity, contradicted=contradicted, **cast(Any, stated)
+        record.judgement,
+        ambiguity=replace(record.judgement.ambiguity, material_share=float(columns["ambiguity"])),
+        same_object=float(columns["same_object"]),
+        right_placement=float(columns["right_placement"]),
+        expected_accuracy=float(columns["expected_accuracy"]),
+        contradicted=bool(columns["contradicted"]),
     )
     quality = measure_quality(asset.field, asset.latents, asset.transform, radius, alignment.ground)
     figures = [

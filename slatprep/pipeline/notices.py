@@ -91,7 +91,7 @@ def unusual_sources(told: Mapping[str, str], failed: Sequence[FailedRecord] = ()
     """
     odd: dict[str, dict[str, str]] = defaultdict(dict)
     for asset_id, lines in told.items():
-        for kind, _, text in (line.partition(": ") for line in lines.split("\n") if line):
+        for kind, _, text in (line.partition(": ") for line in lines.splitlines()):
             odd[kind][asset_id] = text
     for kind, texts in sorted(odd.items()):
         also = ""
