@@ -1,4 +1,4 @@
-"""Reading the sources: names give the pairs, then each side is read and checked, or hashed."""
+"""Find the pairs by the names of their files, and read and check, or hash, each side."""
 
 from __future__ import annotations
 
@@ -104,14 +104,14 @@ _MATRIX = ArraySpec(shapes=((4, 4),), kinds="fiu")
 _EXPECTED = "a 4x4 matrix, source frame to SLAT frame, as numpy.save writes it or as JSON"
 
 _FAR = 100.0
-"""Both sides lie in unit cubes: what is scaled or shifted by more is a mistake."""
+"""Bound on scale and shift of a transform: both sides lie in unit cubes, so more is a mistake."""
 
 
 def _read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], SourceFile]:
     """Read a (4, 4) similarity from a JSON list of rows or an npy file below `root`.
 
-    It takes points of the source's unit cube to the SLAT's. The file is returned as a source of
-    role ``transform``. InputError if the matrix is not a similarity.
+    The matrix maps points of the source's unit cube to the SLAT's. The file is returned as a source
+    of role ``transform``. InputError if the matrix is not a similarity.
     """
     data, source = load_source(path, root, "transform")
     if path.suffix.lower() == ".json":
@@ -131,9 +131,9 @@ def _read_transform(path: Place, root: Place) -> tuple[NDArray[np.float64], Sour
 def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
     """Hash the files of a pair, in the order in which the readers name them.
 
-    Returns what `read_field` and `read_latents` would record as sources, and their digests by
-    role. Of several annotations of an object, those that can be read are hashed. InputError if
-    there is none.
+    Return the sources that `read_field` and `read_latents` would record, and their digests by
+    role. An annotation that cannot be read has the digest ``unreadable``. InputError if no
+    annotation can be read.
     """
     sources: list[SourceFile] = []
     digests: dict[str, str] = {}
@@ -160,7 +160,7 @@ def hash_sources(pair: AssetPair) -> tuple[tuple[SourceFile, ...], dict[str, str
 def _hash_annotation(pair: AssetPair) -> tuple[SourceFile, ...]:
     sources = []
     for role, path in pair.files:
-        # Bounds are not needed: the reader goes on without them, too.
+        # A fault in the bounds is no error: the reader goes on without them, too.
         with suppress(*([InputError] if role == "bounds" else [])):
             sources.append(load_source(path, pair.roots.pixieverse, role)[1])
     return pair.roots.numbered(sources)
@@ -169,7 +169,7 @@ def _hash_annotation(pair: AssetPair) -> tuple[SourceFile, ...]:
 def _hash_slat(
     pair: AssetPair, slat: Place
 ) -> tuple[tuple[SourceFile, ...], StructuredLatents | None]:
-    """Return the files of the latents; and these, where a file holds those of others as well."""
+    """Return the files of the latents, and the latents too if their file holds many assets."""
     space, root = pair.roots.contents.latents, pair.roots.slat
     if pair.slat_group:
         latents = read_slat(slat, root, pair.slat_group, space)
@@ -179,7 +179,7 @@ def _hash_slat(
 
 
 def reading_of(roots: SourceRoots) -> dict[str, str]:
-    """Return which options, besides the bytes, decide how files are read; empty by default."""
+    """Return the options that decide how files are read, by name, without those at the default."""
     space, reading = roots.contents.latents, {}
     if roots.adapter != SourceRoots.adapter:
         reading["adapter"] = f"{roots.adapter} {made_by('slatprep.sources', roots.adapter)}"
@@ -196,15 +196,15 @@ def reading_of(roots: SourceRoots) -> dict[str, str]:
 def source_digests(
     sources: Iterable[SourceFile], shared: StructuredLatents | None = None
 ) -> dict[str, str]:
-    """Return the digest of the content by role.
+    """Return the digest of the content of each role.
 
-    `shared` is given where a file holds the latents of many assets. Their digest then replaces
-    the file's, which changes with every asset added.
+    `shared` are an asset's latents if their file holds many assets. Their digest replaces the
+    file's, which changes with every asset added.
     """
     digests: dict[str, str] = {}
     for source in sources:
         before = digests.get(source.role)
-        # Of several files of a role, such as the meshes of parts, every one counts.
+        # A role may have several files, such as the meshes of parts: chain their digests.
         several = f"{before} {source.sha256}".encode()
         digests[source.role] = hashlib.sha256(several).hexdigest() if before else source.sha256
     if shared is not None:

@@ -40,24 +40,24 @@ class FoundField:
 
 @dataclass(frozen=True)
 class Holding:
-    """What all fields of a source hold: properties, and classes or none."""
+    """Properties that all fields of a source have, and their classes; empty if they have none."""
 
     properties: tuple[records.Property, ...] = records.PROPERTIES
     classes: tuple[str, ...] = records.MATERIAL_CLASSES
 
 
 class SourceAdapter(Protocol):
-    """What a source of annotated voxels offers."""
+    """Interface to a source of annotated voxels."""
 
     @property
     def patterns(self) -> Sequence[str]:
-        """Where its fields lie below the root, unless the dataset definition says otherwise."""
+        """Patterns of the fields' paths below the root; the dataset definition may replace them."""
 
     def describe(self, source: PixieverseSource) -> Holding:
         """Return what the source holds; a build asks once, before anything is read."""
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
-        """Yield its fields; where only names matter, as here, `find_by_pattern` is enough."""
+        """Yield the fields of a source; this default finds them by their names alone."""
         chosen = {"sample": source.sample} if source.sample else {}
         return find_by_pattern(patterns_of(self, source), listing, chosen)
 
@@ -66,19 +66,19 @@ class SourceAdapter(Protocol):
 
 
 class LatentAdapter(Protocol):
-    """What reads the latents of an encoder."""
+    """Interface to the latents of an encoder."""
 
     @property
     def space(self) -> records.LatentSpace:
-        """Their width, grid and moments."""
+        """Channels, grid and moments of the latents."""
 
     def read(
         self, path: records.Place, root: records.Place, group: str, space: records.LatentSpace
     ) -> records.StructuredLatents:
         """Read one SLAT; `space` says whether it has been standardised."""
 
-    # An adapter may also have `patterns`, where its files lie below the root unless the dataset
-    # definition says otherwise.
+    # An adapter may also have `patterns` of its files' paths below the root, which the dataset
+    # definition may replace.
 
 
 SOURCES = {
@@ -92,7 +92,7 @@ SOURCES = {
 
 
 def source_adapter(name: str) -> SourceAdapter:
-    """Return the source adapter of a name; ConfigError if none has it or it does not load."""
+    """Return the source adapter of this name; ConfigError if there is none or it does not load."""
     adapter: SourceAdapter = _loaded("slatprep.sources", name)
     return adapter
 
@@ -144,7 +144,7 @@ def _known(group: str) -> dict[str, tuple[str, str | None]]:
 
 
 def patterns_of(adapter: SourceAdapter, source: PixieverseSource) -> Sequence[str]:
-    """Return the patterns of the dataset definition, or the adapter's where it has none."""
+    """Return the dataset definition's patterns of fields, or the adapter's if it states none."""
     return source.grid if source.grid != PixieverseSource.grid else adapter.patterns
 
 

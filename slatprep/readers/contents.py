@@ -1,6 +1,6 @@
-"""What a dataset holds, as its sources describe it before any field is read.
+"""Contents of a dataset, as its sources describe them before any field is read.
 
-Of latents it is known which encoder made them, and guessed whether they are standardised.
+The user states the encoder of the latents; whether they are standardised may be guessed later.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def contents_of(parameters: BuildParameters) -> Contents:
     Raises
     ------
     ConfigError
-        If a source cannot tell, or a further source holds something else than the first.
+        If a source is not described, or a further source holds what the first one does not.
     """
     held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
     for number, source in enumerate(parameters.also, 1):
@@ -58,7 +58,7 @@ def contents_of(parameters: BuildParameters) -> Contents:
 
 
 def _disagreement(other: Holding, held: Holding) -> str:
-    """Say why annotations cannot be merged into others; empty where they can."""
+    """Say why a further source cannot be merged into the first; empty if it can."""
     if other.classes not in ((), held.classes):
         ours = ", ".join(held.classes) or "none"
         return f"has the classes {', '.join(other.classes)}, [pixieverse] has {ours}"
@@ -76,9 +76,9 @@ def _described(one: Property) -> str:
 
 
 _WIDE_ALONE = 1.2
-"""Spread of the median channel above which one asset alone shows raw latents.
+"""Standard deviation of the median channel above which the latents of a single asset are raw.
 
-Standardised, a dataset's channels have a spread of 1, and three real SLATs alone 0.66 to 0.79.
+A dataset's standardised channels have 1, and those of three real SLATs, each alone, 0.66 to 0.79.
 """
 
 _MAX_BYTES = 2**20
@@ -87,8 +87,9 @@ _MAX_BYTES = 2**20
 def latent_space(source: SlatSource) -> LatentSpace:
     """Return the space of a source's latents, as far as known before they are read.
 
-    ``source.encoder`` is of `LATENTS`, a latent adapter, or a JSON file with ``encoder`` (a name),
-    ``channels``, ``resolution`` and optionally ``mean`` and ``std``. ConfigError if neither fits.
+    ``source.encoder`` names an entry of `LATENTS`, a latent adapter, or a JSON file. The file has
+    ``encoder`` (a name), ``channels``, ``resolution`` and optionally ``mean`` and ``std``.
+    ConfigError if it is none of these.
     """
     own, adapter = LATENTS.get(source.encoder), latent_adapter(source.encoder)
     known = own or (adapter.space if adapter else _read_space(place_of(source.encoder)))
@@ -112,7 +113,7 @@ def _read_space(path: Place) -> LatentSpace:
 def resolve_latents(
     declared: LatentSpace, standardised: str, moments: Sequence[tuple[int, LatentMoments | None]]
 ) -> LatentSpace:
-    """Return the space of a dataset's latents, now that all assets have been read.
+    """Return the space of a dataset's latents after all assets have been read.
 
     `moments` holds the voxel count and moments of each asset, in an order that does not depend on
     the number of jobs. With `standardised` ``auto``, they decide whether latents are standardised.
@@ -130,18 +131,18 @@ def resolve_latents(
     if auto:
         declared = replace(declared, standardised=look_standardised(pooled, declared))
     if not declared.mean and not declared.standardised:
-        # A channel that never changes is left as wide as it is.
+        # A constant channel keeps its scale.
         std = tuple(s if s > 0 else 1.0 for s in pooled.std)
         declared = replace(declared, mean=pooled.mean, std=std)
     return declared
 
 
 def look_standardised(moments: LatentMoments, space: LatentSpace) -> bool:
-    """Whether latents look standardised already.
+    """Return whether latents look standardised already.
 
-    Their spread must be near 1: between 0.5 and 1.5 in the median channel. A standard normal
+    The standard deviation of the median channel must be between 0.5 and 1.5. A standard normal
     must also explain them better than normals with the encoder's mean and standard deviation.
-    Where those are unknown, their mean must be near 0 instead.
+    If the encoder's are unknown, the mean of each channel must be within 0.5 of 0 instead.
     """
     mean, std = np.array(moments.mean), np.array(moments.std)
     if not 0.5 <= np.median(std) <= 1.5:
@@ -155,23 +156,24 @@ def look_standardised(moments: LatentMoments, space: LatentSpace) -> bool:
 
 
 def tell_alone(moments: LatentMoments, space: LatentSpace) -> bool:
-    """Whether the moments of one asset tell if its latents have been standardised.
+    """Return whether the moments of one asset tell if its latents have been standardised.
 
-    An asset's channels spread less than the dataset's, so standardised latents of one may look as
-    if they were not. Those of a wide spread are as encoded, and those that look standardised are.
+    One asset's channels spread less than the dataset's, so its standardised latents may look raw.
+    A wide spread is enough to tell. If the encoder's moments are known, a standardised look is,
+    too.
     """
     spread = float(np.median(moments.std))
     return spread > _WIDE_ALONE or (bool(space.mean) and look_standardised(moments, space))
 
 
 def in_words(moments: LatentMoments) -> str:
-    """Return the spread and the mean of channels in a few words."""
+    """Return the channels' means and standard deviations in a few words."""
     mean, std = np.abs(moments.mean).max(), moments.std
     return f"means within {mean:.2g} of 0, standard deviations {min(std):.2g} to {max(std):.2g}"
 
 
 def pooled_moments(known: Sequence[tuple[int, LatentMoments]]) -> LatentMoments:
-    """Return the moments of several assets together, each with its number of voxels."""
+    """Return the moments of all voxels of several assets from each asset's count and moments."""
     counts = np.array([count for count, _ in known], dtype=np.float64)
     share: NDArray[np.float64] = (counts / counts.sum())[:, None]
     means, stds = (np.array([getattr(one, n) for _, one in known]) for n in ("mean", "std"))

@@ -1,8 +1,8 @@
 """Safe reading of source files: one read gives an array, its size and its hash.
 
-Source files come from strangers. Nothing here unpickles, follows a path out of
-its root, or allocates what a header merely claims. Before it makes an array, it checks shape
-and dtype against the expected ones, and sizes against the bytes that are there.
+Source files come from strangers. Nothing here unpickles, follows a path out of its root, or
+allocates what a header merely claims. Before an array is made, its shape and dtype are compared
+with the expected ones, and its size with the bytes that are there.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile
 from slatprep.storage.place import storage_of
 
 MAX_FILE_BYTES = 128 * 2**20
-"""No file of one asset is larger; the largest form, an 11-channel float64 grid, takes 22 MiB."""
+"""Largest file of one asset; the largest form, an 11-channel float64 grid, takes 22 MiB."""
 
 MAX_MEMBERS = 256
-"""An npz with more members is refused: each costs memory before it is looked at."""
+"""Largest number of members of an npz: each costs memory before it can be checked."""
 
 MAX_FILES = 4096
-"""A Zarr hierarchy of one asset with more files is refused."""
+"""Largest number of files of one asset's Zarr hierarchy."""
 
 _MAX_HEADER_BYTES = 4096
 
@@ -56,9 +56,9 @@ _BEGIN = {
     b"\x89HDF": "it is an HDF5 file",
     b"\x80": "it looks like a pickle",
 }
-"""What files called npz are instead, by their first bytes."""
+"""Explanations why a file named npz cannot be read, by its first bytes."""
 
-# What numpy, zipfile, zlib and h5py raise for bytes that are damaged or of another make.
+# Exceptions that numpy, zipfile, zlib and h5py raise for damaged bytes or another format.
 _DAMAGE = (
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,
     SyntaxError, TypeError, ValueError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
@@ -71,7 +71,7 @@ def refusing(
 ) -> Iterator[None]:
     """Turn what libraries raise for damaged bytes into an error that gives their reason.
 
-    It is an `InputError`, or, with its words, one of another `kind`.
+    The error is an `InputError`, or one of another `kind` with the same text.
     """
     try:
         yield
@@ -83,10 +83,11 @@ def refusing(
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """What an array in a source file may look like: its shape, and its numpy dtype kind.
+    """Shapes and numpy dtype kinds that an array in a source file may have.
 
-    In a shape, None stands for 0 to `max_rows` rows, a range for its sizes. Without `shapes`, any
-    of at most `max_items` items will do. An error adds `note` to the allowed shapes.
+    In a shape, None stands for 0 to `max_rows` rows, and a range for any size in it. Without
+    `shapes`, any shape of 1 to `max_items` values is allowed. An error adds `note` to the allowed
+    shapes.
     """
 
     shapes: tuple[tuple[int | range | None, ...], ...]
@@ -134,7 +135,7 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
         fault = pair.problem or f"nothing for id {pair.asset_id!r}"
         raise MissingPartnerError(root, fault, "a grid and a SLAT per id")
     if pair.problem:
-        # Not by a file's name: which side is at fault, the problem says.
+        # The error names the asset and no file: the problem says which side is at fault.
         fault, _, expected = pair.problem.rpartition("; expected ")
         expected = expected if fault else "one grid and one SLAT per id"
         raise InputError(f"asset {pair.asset_id!r}", fault or pair.problem, expected)
@@ -142,7 +143,7 @@ def require_complete(pair: AssetPair) -> tuple[Place, Place]:
 
 
 def is_hierarchy(path: Place) -> bool:
-    """Whether a source is named as a Zarr hierarchy, which is a folder."""
+    """Return whether a source is named as a Zarr hierarchy, which is a folder."""
     return path.suffix.lower() == ".zarr"
 
 
@@ -171,7 +172,7 @@ def load_source(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]
 
 
 def _load_hierarchy(path: Place, root: Place, role: str) -> tuple[bytes, SourceFile]:
-    """See `load_source`; the same files give the same bytes."""
+    """Load a Zarr hierarchy as `load_source` does; the same files give the same bytes."""
     try:
         names = sorted(storage_of(path).files())
     except StoreError as error:
@@ -187,7 +188,7 @@ def _load_hierarchy(path: Place, root: Place, role: str) -> tuple[bytes, SourceF
             if size > MAX_FILE_BYTES:
                 raise InputError(path, f"is larger than {MAX_FILE_BYTES >> 20} MiB", "one asset")
             member = zipfile.ZipInfo(name)
-            member.create_system = 3  # Else the machine's, and the hash would depend on it.
+            member.create_system = 3  # The default depends on the machine, and so would the hash.
             archive.writestr(member, data)
     whole = packed.getvalue()
     below = source.path.removesuffix(f"/{name}")
@@ -206,7 +207,7 @@ def npy_array(data: bytes, where: str | Place, spec: ArraySpec) -> NDArray[Any]:
 
 
 def is_text(value: NDArray[Any]) -> bool:
-    """Whether an array of text holds characters alone, neither surrogates nor what is above."""
+    """Return whether an array of text has only valid code points, which exclude surrogates."""
     codes = np.ascontiguousarray(value).view(np.uint32)
     return not ((codes > sys.maxunicode) | (codes >> 11 == 0xD800 >> 11)).any()
 
@@ -216,7 +217,7 @@ def npz_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an npz file, each in native byte order.
 
-    With `partial`, any of them may be missing. It decompresses no more than `specs` allow.
+    With `partial`, any of them may be missing. No more is decompressed than `specs` allow.
     InputError if the archive is damaged, or an array is missing or not as specified.
     """
     with _open_zip(data, where) as archive:
@@ -256,7 +257,7 @@ def npz_small_arrays(
 
 
 def _open_zip(data: bytes, where: str | Place) -> zipfile.ZipFile:
-    # zipfile makes an object for every directory entry before one can ask how many there are.
+    # zipfile makes an object for every directory entry before their number can be checked.
     if data.count(b"PK\x01\x02") > MAX_MEMBERS:
         raise InputError(where, f"has more than {MAX_MEMBERS} members", _INTACT_NPZ)
     kind = next((f": {words}" for start, words in _BEGIN.items() if data.startswith(start)), "")
@@ -268,14 +269,14 @@ def _read_member(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str | Place, spec: ArraySpec
 ) -> NDArray[Any]:
     member = f"{where} [{info.filename.removesuffix('.npy')}]"
-    # zipfile bounds its output for these two alone.
+    # zipfile bounds its output only for these two compressions.
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         expected = "stored or deflated members, as numpy.savez and numpy.savez_compressed write"
         raise InputError(member, f"uses zip compression {info.compress_type}", expected)
     with refusing(member, "is damaged", _INTACT_NPZ), archive.open(info) as stream:
         prefix = stream.read(_MAX_HEADER_BYTES)
         _header(prefix, info.file_size, member, spec)
-        # Now that the size is known to be what spec allows, the rest may be inflated.
+        # The header states a size that spec allows, so the rest may be inflated.
         data = prefix + stream.read(max(0, info.file_size - len(prefix)))
     return npy_array(data, member, spec)
 
@@ -292,7 +293,7 @@ def _header(
         length = prefix[8 : 10 if prefix[6:7] == b"\x01" else 12]
         end = 8 + len(length) + int.from_bytes(length, "little")
         shape, fortran, dtype, offset = _parsed(prefix[: min(end, _MAX_HEADER_BYTES)])
-    if any(type(size) is not int for size in shape):  # True is a number, too
+    if any(type(size) is not int for size in shape):  # True is an int, too
         raise InputError(where, f"has shape {shape}", "whole numbers for a shape")
     spec.check(where, shape, dtype)
     wanted = math.prod(shape) * dtype.itemsize
@@ -308,11 +309,11 @@ def _header(
 
 @lru_cache(maxsize=64)
 def _parsed(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Read an npy header, as most assets have the same ones; see `_header`."""
+    """Parse an npy header; the cache helps, as most assets have equal headers."""
     start = io.BytesIO(header)
     version = np.lib.format.read_magic(start)
     if version == (1, 0):
         return *np.lib.format.read_array_header_1_0(start), start.tell()
     if version == (2, 0):
         return *np.lib.format.read_array_header_2_0(start), start.tell()
-    raise ValueError(f"format version {version}")  # 3.0 is for field names: in no plain array
+    raise ValueError(f"format version {version}")  # 3.0 is for field names, not plain arrays

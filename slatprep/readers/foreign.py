@@ -25,14 +25,14 @@ from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
 from slatprep.storage.files import Listing
 
 _MOST_LETTERS, _MOST_COUNT, _MOST_TOLD = 4096, 2**53, 1000
-"""What a record takes of a text, the largest number that every reader of JSON keeps, and what an
-error tells of what an adapter gave."""
+"""Most letters of a text in a record, the largest integer that every reader of JSON keeps, and the
+most bytes of an adapter's text in an error."""
 
 _DIGEST = re.compile("[0-9a-f]{64}")
 
 
 def _is_text(value: object) -> bool:
-    """Whether a record can hold a value as a text: UTF-8 has no surrogates."""
+    """Return whether a record can hold a value as a text: not too long, and without surrogates."""
     if not (isinstance(value, str) and len(value) <= _MOST_LETTERS):
         return False
     return not any("\ud800" <= letter <= "\udfff" for letter in value)
@@ -44,7 +44,7 @@ def _is_count(value: object) -> bool:
 
 @dataclass(frozen=True)
 class _Foreign:
-    """An adapter, its name, and its package with its version; its errors name them."""
+    """An adapter of another package; errors name it, and its package with the version."""
 
     adapter: Any
     name: str
@@ -52,7 +52,7 @@ class _Foreign:
 
     @contextmanager
     def _blamed(self) -> Iterator[None]:
-        """Name the adapter for every error that is not slatprep's."""
+        """Turn every error that is not slatprep's into an error that names the adapter."""
         try:
             yield
         except (SlatprepError, MemoryError):
@@ -62,7 +62,7 @@ class _Foreign:
 
     def _fault(self, what: str) -> InputError:
         who = f"adapter {self.name!r} of {self.package}"
-        # It may have given a text without end, or one that no terminal can show.
+        # The adapter's text may be endless, or a terminal cannot show it.
         told = what.encode("utf-8", "backslashreplace")[:_MOST_TOLD].decode("utf-8", "ignore")
         return InputError(who, told, "what slatprep asks of an adapter; tell its makers")
 
@@ -123,7 +123,7 @@ class ForeignSource(_Foreign):
         with self._blamed():
             every = iter(self.adapter.find(source, listing))
         while True:
-            # Not around the yield: whoever stops asking is no fault of the adapter.
+            # Not around the yield: if the caller stops early, the adapter is not to blame.
             with self._blamed():
                 found = next(every, None)
                 if found is None:
@@ -135,7 +135,7 @@ class ForeignSource(_Foreign):
             yield found
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
-        """Read a field, check it, and hold its values against materials."""
+        """Read a field, check it, and compare its values with those of known materials."""
         with self._blamed():
             field: records.MaterialField = self.adapter.read(pair, max_unphysical)
             self._require(

@@ -59,7 +59,7 @@ def load_group(
 ) -> tuple[dict[str, NDArray[Any]], SourceFile]:
     """Read the named datasets of a group of a file that many assets share, and hash the file.
 
-    InputError if the file leaves `root` or cannot be read, or as `group_arrays`.
+    InputError if the file lies outside `root` or cannot be read, and as in `group_arrays`.
     """
     import h5py
 
@@ -84,7 +84,7 @@ def group_arrays(
     """Read the named datasets of a group of an open file; errors call the file `path`.
 
     An empty `group` is the file's root. With `partial`, any dataset may be missing.
-    InputError if one is missing otherwise, or not as specified.
+    InputError if a required dataset is missing, or a dataset is not as specified.
     """
     import h5py
 
@@ -123,7 +123,7 @@ def _walk_groups(
     import h5py
 
     for key in group:
-        # h5py gives bytes where a name is no UTF-8.
+        # h5py gives bytes for a name that is not UTF-8.
         raw = key if isinstance(key, bytes) else key.encode()
         name = raw.decode(errors="surrogateescape")
         fields = match(components[0], known, name)
@@ -176,7 +176,7 @@ def _read_dataset(dataset: h5py.Dataset, where: str, spec: ArraySpec) -> NDArray
 def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
     """Read a chunked dataset chunk by chunk.
 
-    It undoes the filters itself: HDF5's own pipeline inflates without bound, and some damaged
+    This module undoes the filters: HDF5's own pipeline inflates without bound, and some damaged
     chunks crash it.
     """
     import h5py
@@ -219,7 +219,7 @@ def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
 
 
 def _undo(filters: list[int], data: bytes, chunk_bytes: int, itemsize: int) -> bytes:
-    """Undo HDF5 filters, last first, without inflating beyond a chunk; empty if it cannot be."""
+    """Undo HDF5 filters, last first, without inflating beyond a chunk; empty if that fails."""
     from numcodecs import Fletcher32, Shuffle
 
     for code in reversed(filters):
@@ -235,7 +235,7 @@ def _undo(filters: list[int], data: bytes, chunk_bytes: int, itemsize: int) -> b
 
 
 def _hash_shared(descriptor: int, name: str) -> SourceFile:
-    """Describe an open file that many assets share, hashed once a process, not once an asset."""
+    """Describe an open file that many assets share; its hash is computed once a process."""
     state = os.fstat(descriptor)
     known = state.st_dev, state.st_ino, state.st_mtime_ns, state.st_ctime_ns, state.st_size
     return SourceFile("slat", name, state.st_size, _sha256(descriptor, known))
@@ -244,7 +244,7 @@ def _hash_shared(descriptor: int, name: str) -> SourceFile:
 @lru_cache(maxsize=64)
 def _sha256(descriptor: int, known: tuple[int, ...]) -> str:
     digest, at = hashlib.sha256(), 0
-    while block := os.pread(descriptor, 2**20, at):  # HDF5 keeps the place where it reads
+    while block := os.pread(descriptor, 2**20, at):  # pread leaves HDF5's position alone
         digest.update(block)
         at += len(block)
     return digest.hexdigest()

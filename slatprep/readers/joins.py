@@ -1,4 +1,4 @@
-"""What joins the names of the two sides: maps of ids, categories; and why they do not meet."""
+"""Maps of ids, categories, and explanations why the names of the two sides do not match."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from slatprep.storage.documents import read_bounded, unique
 from slatprep.storage.place import storage_of
 
 MAX_JSON_BYTES = 256 * 2**20
-"""No list of categories is larger; one of 500,000 objects takes 50 MB."""
+"""Largest file of categories; a file of 500,000 objects takes 50 MB."""
 
 _LONGEST_LINE = 2**24
-"""Letters of a line of a map of ids; TRELLIS's captions take some thousand."""
+"""Longest line of a map of ids, in letters; TRELLIS's captions take some thousand."""
 
 _FORMS = (("object_id", "slat_id"), ("file_identifier", "sha256"))
-"""Columns that name objects and SLATs: of our own tables, and of TRELLIS's."""
+"""Columns that name objects and SLATs, in slatprep's own tables and in TRELLIS's."""
 
 _UID = re.compile(r"([0-9a-f]{32})/?$")
 
@@ -72,7 +72,7 @@ def read_map(
 
 
 def _line_of(file: TextIO) -> str:
-    """Return the next line, and not a file without lines as one."""
+    """Return the next line; csv.Error if it is too long, as in a file without line breaks."""
     line = file.readline(_LONGEST_LINE)
     if len(line) == _LONGEST_LINE:
         raise csv.Error(f"a line has more than {_LONGEST_LINE:,} letters")
@@ -139,7 +139,7 @@ def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters)
 
 
 def by_case(grids: Iterable[str], slats: Iterable[str]) -> dict[str, str]:
-    """Return the ids that occur on one side only, by what the other side has but for case."""
+    """Return the other side's id for each id that occurs there only in another letter case."""
     ours, theirs = set(grids), set(slats)
     folded = {name.casefold(): name for name in theirs - ours}
     pairs = [(name, folded.get(name.casefold())) for name in ours - theirs]

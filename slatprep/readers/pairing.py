@@ -25,26 +25,26 @@ from slatprep.storage.files import Listing
 from slatprep.storage.place import storage_of
 
 LOOKED_FOR = "; looked for "
-"""What stands, in the problem of a pair, before the names that its files might have had."""
+"""Text in the problem of a pair before the names that its files might have had."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A row of the store to be: an object and the SLATs with this label, normally just one."""
+    """A future row of the store: an object and its SLATs with this label, normally just one."""
 
     asset_id: str
     object_id: str
     view: str
     slats: tuple[NamedSlat, ...]
     sample: str | None = None
-    """The one of the object's samples that it is of; None where it is of all."""
+    """Sample of the object that the row is made of; None for all samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Found:
     """The names of a source's files; `listing` lists its root.
 
-    Where the SLATs are one file, `roots` have its folder.
+    If all SLATs are in one file, `roots` has its folder.
     """
 
     source: PixieverseSource
@@ -54,7 +54,7 @@ class _Found:
     grids: Mapping[str, list[adapters.FoundField]]
     categories: Mapping[str, str]
     cases: Mapping[str, str]
-    """What the other side calls an id that it has in other letters' case."""
+    """The other side's id, for each id that it has only in another letter case."""
 
 
 def discover(
@@ -67,13 +67,13 @@ def discover(
     parameters : BuildParameters
         Its roots, patterns and maps decide.
     note : callable, optional
-        Gets lines for the user while archives are looked through.
+        Gets lines for the user while archives are searched.
 
     Returns
     -------
     list of AssetPair
         Sorted by `asset_id`, each id once. An unusable pair says why in `problem`.
-        An entry takes 1.2 kB.
+        Each takes 1.2 kB of memory.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def _grids_of(
     if grids:
         return grids
     tried = _tried_grids(source, {})
-    # Plain voxels have the names that SLATs have.
+    # Only for PixieVerse: files of plain voxels have the same names as SLATs.
     ours = source.adapter == PixieverseSource.adapter and slat.root.is_dir()
     other = replace(source, root=slat.root)
     swapped = ours and adapters.find_grids(other, list_below(locate_grids(other)))
@@ -143,9 +143,9 @@ def _rows(
     *,
     each_sample: bool,
 ) -> Iterator[_Row]:
-    """Join objects and SLATs: by the map where it names them, by equal id otherwise.
+    """Join objects and SLATs: by the map if it names them, by equal id otherwise.
 
-    Of an object with several samples, `each_sample` asks for a row for each.
+    With `each_sample`, an object has a row for each of its samples.
     """
     claimed = {slat_id for named in claims.values() for slat_id, _ in named}
     for object_id in {*grids, *claims, *(slats.keys() - claimed)}:
@@ -168,7 +168,7 @@ def _slats_of(
     claims: Mapping[str, list[tuple[str, str]]],
     claimed: set[str],
 ) -> Iterator[tuple[str, NamedSlat]]:
-    """Return the SLATs of an object, each with a label that is unique within the object."""
+    """Yield the SLATs of an object, each with a label that tells it from the object's others."""
     if object_id not in claims:
         if object_id not in claimed:
             for slat in slats.get(object_id, ()):
@@ -212,14 +212,14 @@ def _pair(row: _Row, found: Sequence[_Found], shared: str) -> AssetPair:
 
 
 def _annotations(row: _Row, there: _Found) -> list[list[adapters.FoundField]]:
-    """Return the grids of a row by sample; two grids of a sample are an error."""
+    """Return the grids of a row in groups by sample; `_pair_of` reports two grids of a sample."""
     grids = sorted(there.grids.get(row.object_id, ()), key=_order_of)
     groups = groupby(grids, key=lambda grid: grid.sample)
     return [list(group) for sample, group in groups if row.sample in (None, sample)]
 
 
 def _order_of(found: adapters.FoundField) -> tuple[float, str, str]:
-    """Order samples by number where they have one: 10 comes behind 2."""
+    """Return a sort key that orders samples by number if they have one: 10 comes after 2."""
     number = float(found.sample) if found.sample.isdecimal() else math.inf
     return number, found.sample, found.path
 
@@ -242,14 +242,14 @@ def _pair_of(
             sample = grids[0].sample or source.sample
             known = {"id": row.object_id} | ({"sample": sample} if sample else {})
             if source.adapter == "pixieverse":
-                # A mask of the grid's own name goes before one of all samples.
+                # A mask that is named like the grid precedes a mask of all samples.
                 own = grids[0].path.replace("_pred.npy", "_mask.npy")
                 masks = sorted(source.mask, key=lambda pattern: fill(pattern, known) != own)
                 mask = _find_one(there, masks, known, "mask", problems)
                 bounds = _find_one(there, source.bounds, known, "bounds", problems)
             beside = tuple(there.roots.pixieverse / name for name in grids[0].beside)
             if source.transform:
-                # A name without an id stands for one file, of all assets.
+                # A pattern without an id names one file for all assets.
                 transform = _find_one(there, (source.transform,), known, "transform", problems)
                 if transform is None:
                     tried = fill(source.transform, known)
@@ -266,7 +266,7 @@ def _pair_of(
             "or a pattern with {view}"
         )
     number, sample = there.roots.number, in_unicode(grids[0].sample) if grids else ""
-    # Unique among the object's annotations.
+    # The label is unique among the object's annotations.
     label = filter(None, (f"also_{number}" if number else "", sample))
     return AssetPair(
         asset_id=row.asset_id,
@@ -287,7 +287,7 @@ def _pair_of(
 
 
 def _lacking(row: _Row, there: _Found, side: str, tried: str) -> Iterator[str]:
-    """Say that a side is missing, and whether it has the id in other letters' case."""
+    """Say that a side is missing, and whether it has the id in another letter case."""
     yield f"no {side} for id {row.object_id!r}{LOOKED_FOR}{tried}"
     if other := there.cases.get(row.object_id):
         yield f"a {side} is called {other!r}: rename one, or join them with --map"

@@ -19,14 +19,14 @@ from slatprep.storage.place import storage_of
 FIELDS = ("id", "sample", "view")
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,254}")
-"""What an id or a view may be: one plain path component that is not hidden, no longer than
-file systems allow."""
+"""Form of an id or a view: one plain path component that is not hidden, no longer than file
+systems allow."""
 
 ASSET_ID = re.compile(rf"{NAME.pattern}(\.[A-Za-z0-9._-]{{1,255}})?")
-"""What the id of a row may be: an id, or one and a view."""
+"""Form of the id of a row: an id, or an id, a dot, and a view or sample."""
 
 LOOKED_AT = 20
-"""Folders that are looked into for a hint."""
+"""Number of folders that are searched for a hint."""
 
 _VARIABLE = re.compile(r"(\{[^{}]*\}|\*)")
 
@@ -35,7 +35,7 @@ class Found(NamedTuple):
     """A file that matches a pattern, or a folder on the way that cannot be listed."""
 
     fields: dict[str, str]
-    """What the fields of the pattern stand for, as far as the path goes."""
+    """Values of the pattern's fields, as far as the path has them."""
     path: str
     """Relative to the root."""
     problem: str = ""
@@ -63,7 +63,7 @@ def find_files(
     ConfigError if the pattern makes no sense or the root cannot be listed.
     """
     components = components_of(pattern)
-    # One name needs no search. Most patterns stand for one: that of a file beside a grid.
+    # A pattern without variables needs no search. Most have none: those of files beside a grid.
     if "*" not in (literal := fill(pattern, known)):
         if names.is_file(literal):
             yield Found(dict(known), literal)
@@ -76,7 +76,7 @@ def find_files(
 
 @lru_cache(maxsize=64)
 def components_of(pattern: str) -> tuple[str, ...]:
-    """Split a pattern at its slashes; raise ConfigError where it makes no sense."""
+    """Split a pattern at its slashes; raise ConfigError if it makes no sense."""
     components = tuple(pattern.split("/"))
     if pattern.startswith("/") or any(part in ("", ".", "..") for part in components):
         raise ConfigError(
@@ -95,18 +95,18 @@ def components_of(pattern: str) -> tuple[str, ...]:
 
 
 def fill(pattern: str, known: Mapping[str, str]) -> str:
-    """Return a pattern with its known fields filled in and a ``*`` for the others, also empty."""
+    """Return a pattern with known fields filled in, and ``*`` for unknown and empty fields."""
     for field in FIELDS:
         pattern = pattern.replace(f"{{{field}}}", known.get(field) or "*")
     return pattern
 
 
 def match(component: str, known: Mapping[str, str], name: str) -> dict[str, str] | None:
-    """Return the unknown fields of a name by a component of a pattern, None if it does not match.
+    """Match a name with a component of a pattern; return its unknown fields, or None if it fails.
 
-    A field takes at least one character, ``*`` also none. Where several matches are possible, the
-    leftmost takes most: ``{id}_{view}`` splits ``a_b_c`` into ``a_b`` and ``c``. Time is linear
-    in the name.
+    A field takes at least one character, ``*`` may take none. If several matches are possible, the
+    leftmost field takes most: ``{id}_{view}`` splits ``a_b_c`` into ``a_b`` and ``c``. Time is
+    linear in the name.
     """
     return _fields(*_split(component, known), name)
 
@@ -132,7 +132,7 @@ def _fields(texts: list[str], variables: list[str], name: str) -> dict[str, str]
         return {} if name == texts[0] else None
     if not (begin <= stop and name.startswith(texts[0]) and name.endswith(texts[-1])):
         return None
-    # From the last on, each takes as little as it may: the more is left to those before it.
+    # From last to first, each field takes as little as possible, so that the first takes most.
     fields = {}
     for variable, text in zip(variables[:0:-1], texts[-2:0:-1], strict=True):
         at = name.rfind(text, begin, stop - (variable != "*"))
@@ -171,7 +171,7 @@ def _walk(
     texts, variables = _split(component, known)
     for name in listed:
         if name.startswith("._"):
-            continue  # What macOS writes beside a file on other systems' disks.
+            continue  # macOS writes these beside files on other systems' disks.
         fields = _fields(texts, variables, name)
         if fields is None or fields.get("id") in skip:
             continue
@@ -189,5 +189,5 @@ def held_names(files: Collection[str], folders: Collection[str]) -> str:
 
 
 def tried_names(patterns: Iterable[str], known: Mapping[str, str]) -> str:
-    """Return the names that patterns stand for, as `fill` has them, to print."""
+    """Return the names that patterns stand for, made by `fill`, as a text to print."""
     return ", ".join(fill(pattern, known) for pattern in patterns)

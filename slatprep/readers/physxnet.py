@@ -1,16 +1,16 @@
-"""PhysXNet and its kin: as PhysX-3D's toolkit voxelises it, and as objects of parts.
+"""PhysXNet and similar datasets, as voxels of PhysX-3D's toolkit or as meshes of parts.
 
 The toolkit's ``voxelize.py`` writes the centres of an object's voxels, which are TRELLIS's, to
-``voxels/<id>.ply``. It writes a row of ``property/<id>2.npy`` for each of them: the object's
-largest dimension [cm], the part's rank in touching, its density [g/cm^3], its movement group and
-that group's parent, eight numbers of the movement, and its kind. ``property/<id>1.npy`` holds
-embeddings of text. PhysX-3D's ``tools/1_gptanno.py`` asks for the density in g/cm^3. A part's
-annotation reads ``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
+``voxels/<id>.ply``. Each voxel has a row of ``property/<id>2.npy``: the object's largest dimension
+[cm], the part's rank in touching, its density [g/cm^3], its movement group and that group's
+parent, eight numbers of the movement, and its kind. ``property/<id>1.npy`` holds embeddings of
+text. PhysX-3D's ``tools/1_gptanno.py`` asks for the density in g/cm^3. A part's annotation reads
+``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
 
-Objects of parts have no voxels: a JSON with the materials of each part, and a mesh of each.
-PhysXNet, PhysX-Mobility and PhysXVerse are published so: ``finaljson/<id>.json`` and
-``partseg/<id>/objs/<label>.obj``. PhysX-Anything's ``4_simready_gen.py`` reads of each part
-``density``, ``"Young's Modulus (GPa)"`` and ``"Poisson's Ratio"``, and its mesh at
+Objects of parts have no voxels, but a JSON with the material of each part, and a mesh per part.
+PhysXNet, PhysX-Mobility and PhysXVerse are published in this form: ``finaljson/<id>.json`` and
+``partseg/<id>/objs/<label>.obj``. PhysX-Anything's ``4_simready_gen.py`` reads ``density``,
+``"Young's Modulus (GPa)"`` and ``"Poisson's Ratio"`` of each part, and its mesh at
 ``objs/<label>/<label>.obj``.
 """
 
@@ -46,11 +46,11 @@ class PhysXNet(SourceAdapter):
     patterns = ("property/{id}2.npy",)
 
     def describe(self, source: PixieverseSource) -> Holding:
-        """Say that there is density, and no classes."""
+        """Return the density as the only property, and no classes."""
         return Holding(_TABLE, ())
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
-        """Find the fields by the names of their files; each needs the voxels of its rows."""
+        """Find the fields by the names of their files; each also needs a PLY of its voxels."""
         if "finaljson" in listing.of_folder("", folders=True):
             raise ConfigError(
                 f"{source.root}: is PhysXNet as it is downloaded, annotations of the parts of "
@@ -81,7 +81,7 @@ class PhysXNet(SourceAdapter):
         return field_of_voxels(
             path,
             np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1),
-            # The file's unit, unless the dataset definition states another.
+            # From g/cm^3; if the dataset definition states a unit, it is applied later.
             (1.0 if units.density else 1000.0) * rows[:, _DENSITY : _DENSITY + 1],
             table=_TABLE,
             max_unphysical=max_unphysical,
@@ -96,7 +96,7 @@ _KEYS: dict[str, tuple[str, float, dict[str, float]]] = {
     "density": ("density", 1e3, {"g/cm^3": 1e3, "g/cm³": 1e3, "kg/m^3": 1.0, "kg/m³": 1.0}),
     "poissons_ratio": ("Poisson's Ratio", 1.0, {}),
 }
-"""The key of each property, and in SI units: a bare number of it, units behind a number."""
+"""Key of each property, and factors to SI units of a bare number and of units behind a number."""
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", re.S)
 _MAX_PARTS = 1000
@@ -108,7 +108,7 @@ class Parts(SourceAdapter):
     patterns = ("finaljson/{id}.json",)
 
     def describe(self, source: PixieverseSource) -> Holding:
-        """Say that there are PixieVerse's three properties, and no classes."""
+        """Return PixieVerse's three properties, and no classes."""
         _trimesh()
         return Holding(PROPERTIES, ())
 
@@ -155,7 +155,7 @@ def _parts_of(data: bytes, path: Place) -> list[dict[str, Any]]:
 
 
 def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float:
-    """Return a property of a part in SI units, or as it is where the definition states a unit."""
+    """Return a part's property in SI units; unchanged if the dataset definition states a unit."""
     key, bare, units = _KEYS[name]
     given = part.get(key)
     match = _NUMBER.fullmatch(str(given))
@@ -168,12 +168,12 @@ def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float
 
 
 def _names(name: str, label: str) -> tuple[str, str]:
-    """Return where the mesh of a part of an object may lie."""
+    """Return the two paths at which the mesh of an object's part may lie."""
     return f"partseg/{name}/objs/{label}.obj", f"partseg/{name}/objs/{label}/{label}.obj"
 
 
 def _meshes_of(name: str, listing: Listing) -> dict[str, str]:
-    """Return the meshes of an object by label, also those of no part."""
+    """Return the paths of an object's meshes by label, also of labels that no part has."""
     folder = f"partseg/{name}/objs/"
     files = listing.of_folder(folder, folders=False)
     found = {file[:-4]: folder + file for file in sorted(files) if file.endswith(".obj")}
@@ -196,10 +196,10 @@ def _mesh(path: Place, data: bytes) -> Any:
 
 
 def _voxels(meshes: list[Any], path: Place) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Voxelise the parts, filled: voxels (K, 3) of 64^3, each once, and the part of each.
+    """Voxelise the parts as solids; return voxels (K, 3) of 64^3, each once, and each one's part.
 
-    The object's longest side spans the cube, as in TRELLIS's toolkit. Where parts overlap the
-    smaller one counts, such as what lies inside a shell.
+    The object's longest side spans the cube, as in TRELLIS's toolkit. If parts overlap, the
+    smaller part takes the voxel, such as a part inside a shell.
     """
     low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
     high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)

@@ -42,26 +42,27 @@ MASK = files.ArraySpec(shapes=(_CUBE,), kinds="bfiu")
 BOUND = files.ArraySpec(shapes=(), kinds="biufU")
 
 _DIFFERS, _CONTRADICTS = 0.05, 0.5
-"""Share of a grid that its mask leaves out, or of the mask that is background, above which that is
-told; and above which, of both, the two cannot be of one object."""
+"""Bounds on two shares: voxels with a class that the mask leaves out, and voxels of the mask that
+are background. If one is above the first bound, a warning says so; if both are above the second,
+grid and mask are not of one object."""
 
 UNLABELLED = -1
 """Class id of an occupied voxel that Pixie's labelling set aside."""
 
 _NO_LOG_OF_ZERO = 1e-6
-"""What Pixie adds to density and Young's modulus before it takes log10."""
+"""Offset that Pixie adds to density and Young's modulus before it takes log10."""
 
 # Source channel of each of PROPERTY_COLUMNS; the files begin with density.
 _CHANNEL_ORDER = (1, 0, 2)
 
 
 class PixieVerse(SourceAdapter):
-    """PixieVerse's grids and Pixie's predictions; patterns and samples as `discover` has them."""
+    """Source adapter of PixieVerse's grids and Pixie's predictions."""
 
     patterns = PixieverseSource.grid
 
     def describe(self, source: PixieverseSource) -> Holding:
-        """Say that there are three properties and PhysGaussian's classes."""
+        """Return the three properties and PhysGaussian's classes."""
         return Holding()
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
@@ -80,8 +81,8 @@ def read_grid(
 
     A voxel is occupied if the (64, 64, 64) mask says so or, without a mask, if it is not
     background. It is annotated if it is occupied, of class 0 to 6, its density and Young's modulus
-    are finite and positive, and its Poisson's ratio is in [0, 0.5]. Of a prediction, the
-    properties need only be finite. InputError names file, value and voxel.
+    are finite and positive, and its Poisson's ratio is in [0, 0.5]. The properties of a prediction
+    need only be finite. InputError names file, value and voxel.
     """
     path, _ = files.require_complete(pair)
     root = pair.roots.pixieverse
@@ -145,11 +146,11 @@ def read_prediction(
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Read properties (K, 3) and classes (K,) of a grid at the K voxels of the mask `where`.
 
-    The grid has a form of `read_grid`; its own mask is ignored. Properties come normalised by
-    `normalization`. Normalised values are converted without clipping. SI values are normalised as
-    Pixie does it: 1e-6 is added before log10, and the result is clipped. A class is background
-    where no score is the highest, or the id is -1. InputError if the grid has another form or a
-    value at one of the voxels cannot be measured.
+    The grid has a form of `read_grid`; its own mask is ignored. The returned properties are
+    normalised by `normalization`. Normalised values are converted without clipping. SI values are
+    normalised as Pixie does it: 1e-6 is added before log10, and the result is clipped. A class is
+    background if several scores are the highest, or the id is -1. InputError if the grid has
+    another form, or a value at one of the voxels is not finite or not possible.
     """
     channels, raw, _ = _channels_of(path, root)
     classes = _classes_of(channels, where, path, [])
@@ -182,7 +183,7 @@ def _channels_of(path: Place, root: Place) -> tuple[NDArray[Any], bool, SourceFi
 
 
 def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArray[np.bool_]:
-    bad = ~((values >= 0) & (values <= 1))  # written so that NaN is bad, too
+    bad = ~((values >= 0) & (values <= 1))  # NaN is bad, too
     if bad.any():
         voxel = _first(bad)
         expected = "0 (empty) or 1 (occupied), or a bool"
@@ -199,10 +200,10 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
 def _contradictions(
     path: Place, mask: NDArray[np.bool_], material: NDArray[np.int8], plausibility: str
 ) -> list[str]:
-    """Hold a mask against the classes of its raw grid, and return what a person should know.
+    """Compare a mask with the classes of its raw grid, and return a warning if they differ.
 
-    A prediction may have any class outside its mask. InputError where most of either is not in the
-    other, unless `plausibility` lets that pass.
+    Predictions are not compared, as they may have any class outside the mask. InputError if most of
+    each is not in the other, and `plausibility` is ``refuse``.
     """
     classified = material != BACKGROUND
     both, whole, masked = (
@@ -231,8 +232,8 @@ def _classes_of(
 
 
 def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
-    ids = np.ascontiguousarray(ids)  # Every fourth value of a raw grid, looked at several times.
-    with np.errstate(invalid="ignore"):  # what is no int8 becomes another number
+    ids = np.ascontiguousarray(ids)  # A raw grid's are every fourth value, read several times.
+    with np.errstate(invalid="ignore"):  # values that int8 cannot hold change
         classes = ids.astype(np.int8)
     known = (classes == ids) & (classes >= UNLABELLED) & (classes <= BACKGROUND)
     if not known.all():
@@ -245,7 +246,7 @@ def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
 def _classes_of_scores(
     scores: NDArray[Any], mask: NDArray[np.bool_] | None, path: Place, warnings: list[str]
 ) -> NDArray[np.int8]:
-    """Return the class of the highest score; voxels outside the mask do not matter."""
+    """Return the class of the highest score; voxels outside the mask are background."""
     where = np.ones(_CUBE, dtype=bool) if mask is None else mask
     inside = scores[:, where]
     finite = np.isfinite(inside).all(axis=0)
@@ -255,8 +256,8 @@ def _classes_of_scores(
         raise InputError(path, fault, "finite scores")
     top = inside.max(axis=0)
     best = inside.argmax(axis=0).astype(np.int8)
-    # Where several classes share the highest score (all zero, say), taking the
-    # first would label the voxel jelly for no reason.
+    # If several classes share the highest score (all zero, say), taking the first would label the
+    # voxel jelly for no reason.
     tied = (inside == top).sum(axis=0) > 1
     best[tied] = np.where(inside[BACKGROUND, tied] == top[tied], BACKGROUND, UNLABELLED)
     no_single = tied & (best == UNLABELLED)
@@ -276,7 +277,7 @@ def _annotated(
         fault = f"none of the {np.count_nonzero(occupancy)} occupied voxels is annotated"
         raise InputError(path, fault, "an occupied voxel of class 0 to 6")
     _note(warnings, unlabelled, "occupied voxels have no class (-1); not annotated")
-    # Without a mask what is background is not occupied, and of these there are none.
+    # Without a mask, background voxels are not occupied, and both of these are empty.
     empty, outside = occupancy & background, ~occupancy & ~background
     _note(warnings, empty, "voxels of the mask are background; not annotated")
     _note(warnings, outside, "voxels with a class lie outside the mask; left out")
@@ -289,11 +290,11 @@ def _note(warnings: list[str], voxels: NDArray[np.bool_], what: str) -> None:
 
 
 def _gather(channels: NDArray[Any], cells: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Return the properties (K, 3) at places of the flattened grid, ordered as PROPERTY_COLUMNS.
+    """Return the properties (K, 3) at `cells` of the flattened grid, ordered as PROPERTY_COLUMNS.
 
-    Memory is column by column, as the checks read them.
+    They lie in memory column by column, as the checks read them.
     """
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
         planes = [channels[k].reshape(-1)[cells].astype(np.float32) for k in _CHANNEL_ORDER]
     return np.stack(planes).T
 

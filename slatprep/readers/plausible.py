@@ -1,7 +1,7 @@
-"""What materials can have, who says so, and what people mistake.
+"""Values that materials can have, with their sources, and common mistakes in a dataset's values.
 
-Mistakes are of units, columns, class ids and layouts. The one whose undoing makes implausible
-values plausible is likely the one that was made.
+Mistakes concern units, columns, class ids and layouts. If undoing a mistake makes implausible
+values plausible, it was likely made.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _EXTENTS = (
     # Isotropic and not auxetic (Greaves et al., Nature Materials 10, 2011).
     (0.0, 0.5),
 )
-"""Least and most that any material has of each of `PROPERTIES`."""
+"""Least and largest value of any material, for each of `PROPERTIES`."""
 
 ENOUGH = 64
-"""Voxels below which neither places nor moments say anything of their kind."""
+"""Number of voxels below which coordinates and moments allow no conclusion."""
 
 
 def low_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
-    """Warn where voxels (N, 3) lie in the lowest eighth of a grid, as those of half the side do."""
+    """Warn if voxels (N, 3) lie in the lowest eighth of a grid, as on a grid of half the side."""
     most = voxels.max()
     if len(voxels) < ENOUGH or most >= side // 2:
         return []
@@ -41,29 +41,28 @@ def low_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
     return [oddity("places", f"{text}; {way}")]
 
 
-# Carbon is the stiffest for its weight: diamond has 3.5e8 Pa m^3/kg times its density, fibres have
-# 4.4e8, nanotubes 8e8. E in GPa leaves below 0.1 times the density of any material; Pixie asks its
-# labeller for 13 and more.
+# Bounds on E over density [Pa m^3/kg]. Carbon has the most: diamond 3.5e8, fibres 4.4e8, nanotubes
+# 8e8. If E is in GPa, any material is below 0.1; Pixie asks its labeller for 13 and more.
 _STIFFEST, _SOFTEST = 1e9, 0.1
 
-# Below this density [kg/m^3] only aerogels lie. A foam of relative density r has r^2 times the
-# modulus of what it is made of (Gibson and Ashby, Cellular Solids, 1997): 1e10 Pa at 1,000 kg/m^3
-# is 1e4 times the density squared, and 100 times that is beyond all woods and foams.
+# Only aerogels have a density [kg/m^3] below _LIGHT. A foam of relative density r has r^2 times the
+# modulus of its solid (Gibson and Ashby, Cellular Solids, 1997). A solid of 1e10 Pa and 1,000
+# kg/m^3 has E = 1e4 density^2, and 100 times that is beyond all woods and foams.
 _LIGHT, _FOAM = 10.0, 1e6
 
-# Above this density are metals alone. Pixie gives those of its crates 1e8 Pa, as its solver is
-# explicit; rubber has 1e6 to 1e7. Of metals, magnesium is the lightest in use, with 1,740.
+# Only metals have a density above _HEAVY. Pixie gives the metals of its crates 1e8 Pa, as its
+# solver is explicit; rubber has 1e6 to 1e7. The lightest metal in use is magnesium, with 1,740.
 _HEAVY, _LIGHT_METAL, _RUBBER, _SOFT_METAL = 5_000.0, 1_500.0, 1e7, 1e6
 
-# Stone, glass and ceramics are as dense, and mud is not called stationary; but labels that a
-# simulation is to bear may be as soft.
+# Stone, glass and ceramics are denser than _STONE, and much stiffer than _SOFT_STONE. Labels may
+# still be so soft for a simulation's sake, so they are unusual and not refused.
 _STONE, _SOFT_STONE, _SOFT_BASE = 2_200.0, 2e5, 3e3
 
 # The lightest liquid at room temperature, isopentane, has 620 kg/m^3 (CRC Handbook); no paste or
 # mud is as light as a foam.
 LIGHTEST = {"fluid": 600.0, "visplas": 300.0}
 
-# What PixieVerse's classes have, from the ranges that Pixie asks its labeller for.
+# Range of Young's modulus of PixieVerse's classes, as Pixie asks its labeller for it.
 _USUAL = {
     "jelly": (3e2, 3e8),
     "metal": (1e7, 3e11),
@@ -78,7 +77,7 @@ _UNSTATED = Units()
 
 
 class Part(NamedTuple):
-    """The medians of a class: of the modulus, the density and the ratio; NaN where it lacks one."""
+    """Medians of a class in SI units, NaN for a property it lacks, and its share of the voxels."""
 
     name: str
     share: float
@@ -93,7 +92,7 @@ class Part(NamedTuple):
 
 
 def beyond_all(part: Part) -> str:
-    """Say which value of a part is beyond those of all materials; empty where none is."""
+    """Say which value of a part is outside the range of all materials; empty if none is."""
     for one, (least, most), value in zip(PROPERTIES, _EXTENTS, part.values, strict=True):
         if value < least or value > most:
             unit = "" if one.unit == "1" else f" {one.unit}"
@@ -103,7 +102,7 @@ def beyond_all(part: Part) -> str:
 
 
 def fault_of(part: Part, units: Units = _UNSTATED) -> str:
-    """Say what a part has that no material has; empty where there is nothing."""
+    """Say which values of a part no material has; empty if all are plausible."""
     modulus, density = part.modulus, part.density
     if fault := beyond_all(part):
         return fault
@@ -124,14 +123,14 @@ def fault_of(part: Part, units: Units = _UNSTATED) -> str:
         return f"{both}: no material is so soft and so heavy"
     if density > _HEAVY and modulus < _RUBBER:
         return f"{both}: a metal's density, and not its stiffness"
-    # What is lighter than metals is likely of another class: a label's own error.
+    # A lighter part is likely of another class: then the label is wrong, and not the unit.
     if part.name == "metal" and modulus < _SOFT_METAL and density > _LIGHT_METAL:
         return f"Young's modulus {modulus:.3g} Pa, and no metal is so soft"
     return ""
 
 
 def oddity_of(part: Part, units: Units) -> str:
-    """Say what is unusual of a part, though a material may have it; empty where nothing is."""
+    """Say which values of a part are unusual, though possible; empty if none is."""
     if units.youngs_modulus or part.name not in ("stationary", ""):
         return ""
     if part.density > _STONE and part.modulus < _SOFT_STONE:
@@ -145,23 +144,23 @@ def oddity_of(part: Part, units: Units) -> str:
 
 
 def is_usual(part: Part) -> bool:
-    """Whether PixieVerse has such values in a class."""
+    """Return whether a part's values are in PixieVerse's ranges for its class."""
     least, most = _USUAL.get(part.name, _USUAL_MODULUS)
     lo, hi = _USUAL_DENSITY
-    # What is NaN is beyond no end.
+    # Comparisons with NaN are false, so that a property that is missing passes.
     return not (
         part.modulus < least or part.modulus > most or part.density < lo or part.density > hi
     )
 
 
 def is_physical(part: Part) -> bool:
-    """Whether the reader takes such values at all; see `slatprep.records.Property.physical`."""
+    """Return whether the reader accepts the values, as `slatprep.records.Property.physical`."""
     above = all(math.isnan(one) or 0 < one < math.inf for one in (part.modulus, part.density))
     return above and not (part.ratio < 0 or part.ratio > 0.5)
 
 
 class Mistake(NamedTuple):
-    """Something that people mistake: in words, the setting that mends it, and how it is undone."""
+    """A common mistake: its description, the setting that corrects it, and its undoing."""
 
     words: str
     setting: str
@@ -187,7 +186,7 @@ def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
 
 
 def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
-    """Yield what people mistake: units of one or both columns, ids of classes, and columns."""
+    """Yield common mistakes: units of one or both columns, ids of classes, and swapped columns."""
     named = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
              "density": ("g/cm^3", f"{LOG10}kg/m^3")}  # fmt: skip
     lacking = [name for name, k in (("youngs_modulus", 0), ("density", 1))
@@ -195,7 +194,7 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
     modulus, density = (
         [""] if units.of(name) or name in lacking else ["", *known] for name, known in named.items()
     )
-    # Both as logarithms is likelier than a unit for each.
+    # Among pairs of units, two logarithms are the likeliest.
     pairs = sorted(
         product(modulus, density),
         key=lambda pair: (sum(map(bool, pair)), not all(one.startswith(LOG10) for one in pair)),
@@ -225,24 +224,24 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
 
 
 def in_toml(units: Mapping[str, str]) -> str:
-    """Say units by property as a dataset definition does; empty where none is stated."""
+    """Return units by property as a dataset definition writes them; empty if none is stated."""
     given = ", ".join(f'{name} = "{unit}"' for name, unit in units.items() if unit)
     return given and f"units = {{ {given} }}"
 
 
 def _scaled(units: tuple[str, str], part: Part) -> Part:
-    """Bring modulus and density from these units to SI units."""
+    """Convert modulus and density from these units to SI units."""
     modulus, density = map(float, map(to_si, (part.modulus, part.density), units))
     return part._replace(modulus=modulus, density=density)
 
 
 def _moved(order: Sequence[int], part: Part) -> Part:
-    """Undo that column `order[at]` lies where column `at` belongs."""
+    """Undo a swap that put column `order[at]` at the place of column `at`."""
     return Part(part.name, part.share, *(part.values[order.index(k)] for k in range(3)))
 
 
 def _look_normalised(parts: Sequence[Part]) -> bool:
-    """Whether all columns lie in [-1, 1] and one where no unit would bring it there."""
+    """Return whether all values lie in [-1, 1], and one of them is impossible in any unit."""
     values = [value for part in parts for value in part.values if not math.isnan(value)]
     below = any(part.modulus < 0 or part.density < 0 for part in parts)
     strange = any(part.ratio < 0 or part.ratio > 0.5 for part in parts)

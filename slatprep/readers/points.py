@@ -15,10 +15,11 @@ from slatprep.readers.files import refusing
 from slatprep.records import Place
 
 _HEADER_BYTES = 2**18
-"""Bytes that a header may have; one of Gaussians has some 2,000."""
+"""Largest header, in bytes; the header of a PLY of Gaussians has some 2,000."""
 
 _SLOW_VALUES, _SLOW_BYTES, _LINE_BYTES = 1_000_000, 48 * 2**20, 2**16
-"""What a PLY of text or with lists may have: plyfile reads it value by value, 1 µs each."""
+"""Most values, bytes, and bytes in a line of a PLY of text or with lists: plyfile reads such a PLY
+value by value, 1 µs each."""
 
 _AXES = ("x", "y", "z")
 
@@ -42,7 +43,7 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
         header, start, counts = _header(data)
         if max(counts, default=0) > len(data) - start:
             raise ValueError("announces more rows than it has")
-        # Without rows: plyfile reserves memory for what a header claims.
+        # The counts are set to 0: plyfile reserves memory for what a header claims.
         described = read(_with_counts(header, [0] * len(counts)))
         names = [element.name for element in described.elements]
         if "vertex" not in names:
@@ -85,7 +86,7 @@ def _header(data: bytes) -> tuple[list[bytes], int, list[int]]:
     if match is None:
         raise ValueError(f"its header does not end in the first {_HEADER_BYTES:,} bytes")
     lines = [line + match[1] for line in match[0].split(match[1])[:-1]]
-    # int, as plyfile: a sign and underscores count.
+    # plyfile, too, parses them by int, which takes a sign and underscores.
     counts = [int(line.split()[2]) for line in lines if line.startswith(b"element ")]
     if min(counts, default=0) < 0:
         raise ValueError("announces rows below 0")
@@ -93,7 +94,7 @@ def _header(data: bytes) -> tuple[list[bytes], int, list[int]]:
 
 
 def _with_counts(lines: list[bytes], counts: list[int]) -> bytes:
-    """Return a header with as many elements as there are counts, of so many rows."""
+    """Return a header with its first elements, one for each of `counts`, with that many rows."""
     kept: list[bytes] = []
     left = iter(counts)
     for line in lines[:-1]:
@@ -108,7 +109,7 @@ def _with_counts(lines: list[bytes], counts: list[int]) -> bytes:
 
 
 def _sizes(properties: Sequence[Any]) -> tuple[list[int], bool]:
-    """Return the least bytes of a row's values in a binary PLY, and whether any is a list."""
+    """Return the fewest bytes of each value of a row in a binary PLY, and whether any is a list."""
     lists = [hasattr(one, "len_dtype") for one in properties]
     kinds = [getattr(one, "len_dtype", one.val_dtype) for one in properties]
     return [np.dtype(kind).itemsize for kind in kinds], any(lists)

@@ -1,4 +1,4 @@
-"""PixieVerse as it is published: where its grids lie below whatever a user points at.
+"""PixieVerse as it is published: find its grids below the folder or archive that a user names.
 
 The dataset on the hub has ``archives/DIRECTORY/CLASS.tar``, which its own instructions unpack
 into ``DIRECTORY/``. Grids are in the directory ``render_outputs``.
@@ -22,7 +22,7 @@ from slatprep.storage.place import storage_of
 GRIDS, ARCHIVES = "render_outputs", "archives"
 
 _EVERY_S = 10.0
-"""How often it is told how far reading is."""
+"""Seconds between two lines about progress."""
 
 OTHERS = {
     "data": "rendered views",
@@ -31,14 +31,14 @@ OTHERS = {
     "vlm_seg_critic_results": "judgements of segmentations",
     "vlm_seg_mat_sample_results": "sampled materials",
 }
-"""What the other directories hold."""
+"""Content of the dataset's other directories, by name."""
 
 
 def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = None) -> Place:
-    """Return the folder of the objects below a source's root, which archives may hold.
+    """Return the folder of the objects below a source's root, which may lie in archives.
 
     The root is the dataset's, its folder of archives, one archive, or the objects' folder.
-    ConfigError if an archive or its folder cannot be looked at.
+    ConfigError if an archive or its folder cannot be read.
     """
     root = source.root
     if source.adapter != PixieverseSource.adapter:
@@ -65,7 +65,7 @@ def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = 
 
 
 def fetch_members(pairs: Iterable[AssetPair], note: Callable[[str], None] | None) -> None:
-    """Bring what pairs need of archives elsewhere into the cache, and tell how far that is.
+    """Fetch the members of remote archives that pairs need into the cache, and report progress.
 
     ConfigError if an archive cannot be read.
     """
@@ -81,7 +81,7 @@ def fetch_members(pairs: Iterable[AssetPair], note: Callable[[str], None] | None
 
 
 def _telling(what: str, note: Callable[[str], None] | None) -> Callable[[int, int], None]:
-    """Return what is told bytes, those done and all, and gives a line now and then."""
+    """Return a function that takes the bytes done and all bytes, and notes them now and then."""
     told = time.monotonic()
 
     def tell(done: int, total: int) -> None:
@@ -94,7 +94,7 @@ def _telling(what: str, note: Callable[[str], None] | None) -> Callable[[int, in
 
 
 def hint_of(source: PixieverseSource) -> str:
-    """Say what lies where no grid was found, and what to point at; empty where nothing helps."""
+    """Say what a root without grids holds, and what to point at; empty if nothing is known."""
     root, adapter = source.root, source_adapter(source.adapter)
     named = next((place.name for place in (root, root.parent) if place.name in OTHERS), "")
     try:
@@ -135,7 +135,7 @@ def _held_in_archives(place: ArchivePlace) -> str:
 
 
 def category_of(grid: Place | None) -> str:
-    """Return the class that the name of a grid's archive tells; empty where none does."""
+    """Return the category that a grid's archive is named after; empty if there is none."""
     if not isinstance(grid, ArchivePlace) or grid.archive is None:
         return ""
     name = grid.archive.place.name.partition(".")[0]

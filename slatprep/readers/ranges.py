@@ -16,10 +16,10 @@ from slatprep.storage.documents import read_bounded, unique
 
 _MAX_BYTES = 2**20
 
-# Beyond all units: ranges are in log10, and what is divided by their width must not overflow.
+# Larger than any bound in log10, and small enough that normalising does not overflow.
 _MAX_BOUND = 1e6
 
-# What Pixie's file calls each of PROPERTY_COLUMNS.
+# Names of PROPERTY_COLUMNS in Pixie's file.
 _PIXIE_WORDS = ("E", "density", "nu")
 
 
@@ -34,8 +34,8 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
         hi = 11.0
 
     Pixie's file has ``density_p1``, ``density_p99``, ``E_p1``, ``nu_p1`` and so on in the same
-    units, as JSON or in lines. Where these are missing, ``density_min``, ``density_max`` and so on
-    count. ConfigError if the file cannot be read, lacks a property or has an empty range.
+    units, as JSON or in lines. If these are missing, ``density_min``, ``density_max`` and so on
+    are read. ConfigError if the file cannot be read, lacks a property or has an empty range.
     """
     try:
         text = read_bounded(path, _MAX_BYTES).decode()

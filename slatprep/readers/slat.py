@@ -29,9 +29,9 @@ from slatprep.storage.place import storage_of
 
 
 def texture_of(path: Place, space: LatentSpace) -> Place | None:
-    """Return the file of texture latents that belongs to one of shape latents.
+    """Return the file of texture latents that belongs to a file of shape latents.
 
-    None where the encoder has none; InputError where the folders are not those of TRELLIS.2.
+    None if the encoder has no texture latents; InputError if the folders are not TRELLIS.2's.
     """
     if not space.encoder.startswith("trellis2-shape-pbr"):
         return None
@@ -40,7 +40,7 @@ def texture_of(path: Place, space: LatentSpace) -> Place | None:
 
 @lru_cache(maxsize=64)
 def _textures_of(shapes: Place) -> Place:
-    """Return the folder of texture latents beside one of shape latents; listed once a process."""
+    """Return the folder of texture latents of a folder of shape latents; listed once a process."""
     model, home = shapes.name, shapes.parent
     textures = home.parent / "pbr_latents"
     like = "".join(model.rpartition("_")[1:])  # such as _1024
@@ -55,13 +55,13 @@ def _textures_of(shapes: Place) -> Place:
 
 
 COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
-"""Coordinates, or these behind a batch column."""
+"""Coordinates, with or without a leading batch column."""
 
 _LARGEST = 1e4
-"""No known encoder gives latents so large: theirs have a spread of some units."""
+"""Largest usual latent: the latents of known encoders have a spread of some units."""
 
 _MANY_EMPTY = 0.05
-"""Share of rows of zeros, of which encoders give none."""
+"""Largest usual share of rows of zeros; encoders give none."""
 
 
 def read_slat(
@@ -69,9 +69,9 @@ def read_slat(
 ) -> StructuredLatents:
     """Read one SLAT from npz or HDF5.
 
-    It holds integer ``coords``, (N, 3) or (N, 4) with a leading batch column of zeros, and float
-    ``feats``, (N, C) with the encoder's channels C. Other arrays are ignored. Where the encoder has
-    texture latents behind those of the shape, they come from a file of their own.
+    The file holds integer ``coords``, (N, 3) or (N, 4) with a leading batch column of zeros, and
+    float ``feats``, (N, C) with the encoder's channels C. Other arrays are ignored. If the encoder
+    has texture latents behind those of the shape, they are read from a second file.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def read_slat(
     group : str
         The SLAT's group in an HDF5 file with several; empty for the root.
     space : LatentSpace
-        What the encoder gives.
+        The space of the encoder's latents.
 
     Returns
     -------
@@ -206,7 +206,7 @@ def _check_feats(
 ) -> NDArray[np.float32]:
     if feats.dtype.itemsize > 4:
         warnings.append(f"feats: {feats.dtype.name} rounded to float32")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
         latents = np.ascontiguousarray(feats, dtype=np.float32)
     finite = np.isfinite(latents)
     if not finite.all():
@@ -219,7 +219,7 @@ def _check_feats(
     if largest > _LARGEST:
         odd.append(f"feats reach {largest:.3g}, and known encoders' lie within some tens of 0")
     if len(latents) < ENOUGH:
-        pass  # So few may be alike by chance.
+        pass  # A few rows may be alike by chance.
     elif still.all():
         odd.append(f"feats are the same in all {len(latents):,} rows")
     elif still.any():

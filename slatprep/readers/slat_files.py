@@ -21,7 +21,7 @@ _UNPACKED = "and SLATs are read unpacked: `tar -xf ARCHIVE -C FOLDER`, then poin
 
 @dataclass(frozen=True, slots=True)
 class NamedSlat:
-    """A SLAT by its own names; `path` is empty where a map names a SLAT that does not exist."""
+    """A SLAT and the names it was found by; `path` is empty if only a map of ids names it."""
 
     slat_id: str
     view: str
@@ -107,7 +107,7 @@ def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]
 
 
 def _hint(source: SlatSource) -> str:
-    """Say in which folder below the root SLATs lie, or what it holds; empty if neither is known."""
+    """Say which folder below the root has SLATs, or what the root holds; empty if unknown."""
     try:
         files, folders = storage_of(source.root).names()
         for name in sorted(folders)[:LOOKED_AT]:
@@ -122,7 +122,7 @@ def _hint(source: SlatSource) -> str:
 
 
 def slat_patterns(source: SlatSource) -> tuple[str, ...]:
-    """Return the patterns of the dataset definition, or the encoder's own where it has none."""
+    """Return the dataset definition's patterns of SLATs, or the encoder's if it states none."""
     usual = SlatSource.pattern
     if source.pattern != usual:
         return source.pattern
@@ -132,7 +132,7 @@ def slat_patterns(source: SlatSource) -> tuple[str, ...]:
         return own or usual
     if not space.encoder.startswith("trellis2"):
         return usual
-    # The folder into which TRELLIS.2's toolkit puts latents of this kind and fineness.
+    # The folder into which TRELLIS.2's toolkit puts latents of this kind and resolution.
     kind = "pbr" if space.encoder.startswith("trellis2-pbr") else "shape"
     folder = f"{kind}_latents/*_{16 * space.resolution}/"
     return tuple(one.replace("shape_latents/*_1024/", folder) for one in usual)
@@ -160,7 +160,7 @@ def _each_slat(source: SlatSource, one_file: bool) -> Iterator[NamedSlat]:
 def _each_group(
     source: SlatSource, root: Place, path: str, known: Mapping[str, str] | None = None
 ) -> Iterator[NamedSlat]:
-    """Return the SLATs that lie as groups in one HDF5 file."""
+    """Yield the SLATs that are groups of one HDF5 file."""
     if "{id}" not in source.group:
         raise ConfigError(f"group pattern {source.group!r} names no {{id}}")
     try:

@@ -1,4 +1,4 @@
-"""Which objects are for training, validation and test: by a hash, a rule, or lists of ids."""
+"""Split objects into training, validation and test, by a hash, a rule, or lists of ids."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Shares:
 
     def __post_init__(self) -> None:
         values = (self.train, self.val, self.test)
-        if not (min(values) >= 0 and abs(sum(values) - 1) <= 1e-9):  # NaN is neither
+        if not (min(values) >= 0 and abs(sum(values) - 1) <= 1e-9):  # NaN fails both
             raise ConfigError(
                 f"shares of train, val and test are {values}; "
                 "expected three numbers from 0 to 1 that add up to 1, such as 0.8, 0.1, 0.1"
@@ -40,9 +40,9 @@ class Shares:
 
 
 def position_of(object_id: str) -> float:
-    """Return where an object lies in [0, 1): the first 8 bytes of its id's SHA-256, over 2^64."""
+    """Return an object's position in [0, 1): the first 8 bytes of its id's SHA-256, over 2^64."""
     digest = hashlib.sha256(object_id.encode("utf-8")).digest()
-    # 53 bits are what a float64 holds exactly, so the result never rounds up to 1.
+    # A float64 holds 53 bits exactly, so the result never rounds up to 1.
     return (int.from_bytes(digest[:8], "big") >> 11) / 2**53
 
 
@@ -59,10 +59,10 @@ def split_of(object_id: str, shares: Shares = Shares()) -> Split:
 
 
 def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[str, Split]:
-    """Return the split of every object of a dataset, such that no split with a share is empty.
+    """Return the split of every object of a dataset, so that no split with a share is empty.
 
-    `split_of` decides. In a dataset so small that a split would be empty, that split takes the
-    nearest object in [0, 1) from a split that has several. This needs as many objects as splits.
+    `split_of` decides. A split that would be empty takes the object nearest to it in [0, 1) from a
+    split that has several. This needs at least as many objects as splits.
     Training and test must pass the same `object_ids`: all of the dataset, before any filter.
     """
     splits = {object_id: split_of(object_id, shares) for object_id in sorted(set(object_ids))}
@@ -91,10 +91,10 @@ _FORMS = (
 
 @dataclass(frozen=True)
 class Assignment:
-    """Which split each object of a dataset is in, by its id.
+    """Split of each object of a dataset, by its id.
 
-    Of a file of lists, `unknown` are ids that the dataset does not have, and `unlisted` the objects
-    that no list names; these are in no split.
+    If a file of lists decides, `unknown` are listed ids that the dataset lacks. `unlisted` are the
+    objects that no list names; they are in no split.
     """
 
     splits: dict[str, Split]
@@ -102,7 +102,7 @@ class Assignment:
     unlisted: tuple[str, ...] = ()
 
     def lists(self) -> dict[Split, list[str]]:
-        """Return the objects of each split, sorted: what `read_lists` reads."""
+        """Return the objects of each split, sorted, in the form that `read_lists` reads."""
         ids = sorted(self.splits)
         return {split: [one for one in ids if self.splits[one] == split] for split in SPLITS}
 
@@ -117,9 +117,9 @@ def assign_splits(
 
     The rule `by` is ``hash`` (see `split_objects`), ``pixie`` (see `pixie_test_objects`),
     ``category:NAME`` (that category is the test set), or the path of a file (see `read_lists`).
-    `shares` serve ``hash``. Where a rule gives only the test set, a hash parts the others in the
-    proportion of train and val. `assets` maps asset ids, by which a file may name objects, to
-    object ids. ConfigError if the category is unknown or a file puts an object into two splits;
+    `shares` apply to ``hash``. If a rule gives only the test set, a hash splits the others in the
+    shares' proportion of train and val. `assets` maps asset ids, by which a file may name objects,
+    to object ids. ConfigError if the category is unknown or a file puts an object into two splits;
     InputError if the file is unusable or names no object of the dataset.
     """
     if by == HASH:
@@ -145,8 +145,8 @@ def pixie_test_objects(object_ids: Iterable[str]) -> list[str]:
     sorted. The objects that Pixie itself tested on are in its ``test_set.json``.
     """
     ordered = sorted(set(object_ids))
-    # torch.randperm swaps each place with one drawn from those not yet filled: a 32-bit
-    # word of MT19937, seeded as numpy's legacy generator is, modulo their number.
+    # torch.randperm swaps each place with a place drawn from those not yet filled. It draws a
+    # 32-bit word of MT19937, seeded as numpy's legacy generator is, modulo their number.
     words = np.random.RandomState(42)
     for place in range(len(ordered) - 1):
         other = place + int(words.randint(0, 2**32, dtype=np.uint32)) % (len(ordered) - place)
@@ -169,7 +169,7 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
             listed: Any = names.tolist()
         elif path.suffix == ".json":
             listed = parse_json(data)
-            json.loads(data, object_pairs_hook=unique)  # What is read above takes the last.
+            json.loads(data, object_pairs_hook=unique)  # parse_json takes the last of two keys.
         else:
             listed = [
                 line.strip() for line in data.decode("utf-8-sig").splitlines() if line.strip()
@@ -227,7 +227,7 @@ def _by_file(
 
 
 def _around(test: Iterable[str], objects: Iterable[str], shares: Shares) -> dict[str, Split]:
-    """Return all splits around a given test set; a hash parts the other objects."""
+    """Return the split of each object for a given test set; a hash splits the other objects."""
     splits: dict[str, Split] = dict.fromkeys(test, "test")
     others = shares.train + shares.val
     if others == 0:

@@ -1,7 +1,7 @@
-"""A source's values, held against what materials have before anything is made of them.
+"""Compare a source's values with the values of known materials before they are used.
 
-Most voxels decide: the medians of each class are looked at, so that stray voxels cost nothing.
-Where no material has them, the likeliest mistake is named.
+The medians of each class are compared, so that stray voxels do not matter. If no material has
+such medians, a message names the likeliest mistake.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ from slatprep.records import (
 _GUESS = re.compile(r"the values look like (.+?)(?: \(or |: )")
 
 _PREDICTED = 1.5
-"""Half the values of a prediction lie within this; log10 of most densities is above it."""
+"""Largest median magnitude of a prediction's values; log10 of most densities is above it."""
 
 FOR_ALL = "Such keys hold for all objects: where this one alone is so, mend its file"
-"""What a person should know of a key that a message names."""
+"""End of a message that names a key of the dataset definition."""
 
 _SAMPLE = 1024
-"""Voxels that are looked at: enough for medians, and a tenth of a millisecond."""
+"""Fewest voxels to which many are thinned: enough for medians, in a tenth of a millisecond."""
 
 _SHARE = 0.5
-"""The share of an asset's voxels that must be implausible for the asset to be."""
+"""Share of implausible voxels at which an asset is implausible."""
 
 _FEW = 0.05
-"""A class with a smaller share of the voxels does not count."""
+"""Smallest share of the voxels at which a class counts."""
 
 
 def require_plausible(
@@ -62,11 +62,11 @@ def require_plausible(
     classes: Sequence[str],
     roots: SourceRoots,
 ) -> list[str]:
-    """Bring values (K, P) to SI units, in place; hold them and classes (K,) against materials.
+    """Convert values (K, P) to SI units in place; compare them, by class (K,), with materials.
 
-    `roots` say what units the values have. Returns what a person should know; raises `InputError`
-    where most voxels cannot be and `roots.plausibility` is ``refuse``. Values that are none, such
-    as NaN, are left to the reader.
+    `roots` state the units of the values. Returns warnings; raises `InputError` if most voxels are
+    implausible and `roots.plausibility` is ``refuse``. Checking for NaN and other invalid values
+    is left to the reader.
     """
     for column, one in enumerate(table):
         unit = roots.units.of(one.name)
@@ -88,7 +88,7 @@ def require_plausible(
         return [oddity("values", f"{name} ({share:.0%} of the voxels) has {fault}")]
     likely = mistakes_of(parts, roots.units)
     if not likely and not is_physical(part):
-        return []  # The reader refuses it, and says which voxel.
+        return []  # The reader refuses it, and names the voxel.
     what = f"{name} has {fault}"
     advice = "values that a material has, in SI units"
     if likely:
@@ -104,7 +104,7 @@ def require_plausible(
 
 
 def guess_in(reason: str) -> str:
-    """Return what `require_plausible` says that refused values look like; empty if it does not."""
+    """Return the mistake that `require_plausible` guesses in its message; empty if it has none."""
     found = _GUESS.search(reason)
     return found[1] if found else ""
 
@@ -112,10 +112,10 @@ def guess_in(reason: str) -> str:
 def require_prediction(
     where: str | Place, values: NDArray[Any], material: NDArray[Any], plausibility: str = ""
 ) -> list[str]:
-    """Hold normalised values (K, 3) and classes (K,) against what a network predicts.
+    """Check that normalised values (K, 3) with classes (K,) look like a network's prediction.
 
-    It may leave [-1, 1], but not in most voxels; otherwise like `require_plausible`.
-    Without a setting for `plausibility`, such values are refused.
+    Values may leave [-1, 1], but not in most voxels; otherwise like `require_plausible`.
+    If `plausibility` is empty, other values are refused.
     """
     if plausibility == "off" or len(values) == 0:
         return []
@@ -146,9 +146,9 @@ def require_prediction(
 
 
 def require_possible(where: str | Place, values: NDArray[Any], material: NDArray[Any]) -> None:
-    """Refuse predicted values (K, 3) in SI units that are mostly beyond those of all materials.
+    """Refuse predicted values (K, 3) in SI units if most are outside the range of all materials.
 
-    Else they are measured: that a method predicts what no material has is its own error.
+    Other implausible values are measured: they are errors of the method.
     """
     parts = [part for part in _parts(values, material, PROPERTIES, MATERIAL_CLASSES)
              if part.name != MATERIAL_CLASSES[BACKGROUND]]  # fmt: skip
@@ -166,7 +166,7 @@ def _parts(
     table: Sequence[Property],
     classes: Sequence[str],
 ) -> list[Part]:
-    """Return the medians of the classes that have a share that counts, of a sample of voxels."""
+    """Return the medians of each class in a sample of voxels, without classes below `_FEW`."""
     step = max(1, len(values) // _SAMPLE)
     sample = values[::step].astype(np.float64)
     columns = {one.name: (k, one.unit) for k, one in enumerate(table)}

@@ -1,4 +1,4 @@
-"""Annotated voxels of any grid, or points, become a field on the frame's 64^3 grid."""
+"""Convert annotated voxels of any grid, or points, to a field on the frame's 64^3 grid."""
 
 from __future__ import annotations
 
@@ -41,11 +41,12 @@ def field_of_voxels(
     them, at most 254. Errors call the source `where`.
 
     Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
-    voxels' most frequent class (the lowest at a tie) and mean properties, in log10 where the
-    normalisation is. InputError if there is no voxel, one is out of range, or too many are
-    unphysical. `names` are those of the classes; `roots` say which units the values have, and
-    what becomes of implausible ones. Where a file `description` states the resolution, integers are
-    voxels as they are in the source: each once, and in all of the grid.
+    voxels' most frequent class (the lowest at a tie) and the mean properties of that class's
+    voxels. The mean is in log10 for properties that are normalised in log10. InputError if there is
+    no voxel, one is out of range, or too many are unphysical. `names` are the classes' names;
+    `roots` state the units of the values and how implausible ones are treated. If a file
+    `description` states the resolution, a voxel may not occur twice with different values, and
+    voxels that fill only an eighth of the grid give a warning.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
@@ -57,7 +58,7 @@ def field_of_voxels(
         own = given.astype(np.int64)
     if given.shape != (count,) or ((own < 0) | (own >= classes) | (own != given)).any():
         raise InputError(where, "has classes that are none", f"{count} of 0..{classes - 1}")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and a fault
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
@@ -82,9 +83,9 @@ def field_of_voxels(
             _require_alike(where, np.flatnonzero(keep), own_cells, own, values)
         notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(cell)} of {side}^3")
     there = np.full(side**3, -1, dtype=np.int64)
-    there[flat] = len(cell)  # occupied at least
+    there[flat] = len(cell)  # occupied, annotated or not
     there[cell] = np.arange(len(cell))
-    # A cell of the 64^3 grid takes what the source has at its centre.
+    # A cell of the 64^3 grid takes the source's cell at its centre.
     steps = (2 * np.arange(records.RESOLUTION) + 1) * side // (2 * records.RESOLUTION)
     rows = there.reshape((side,) * 3)[np.ix_(steps, steps, steps)]
     annotated = (rows >= 0) & (rows < len(cell))
@@ -122,7 +123,7 @@ def _cells_of(
 
 
 def physical(values: NDArray[np.float32], table: Sequence[records.Property]) -> NDArray[np.bool_]:
-    """Return which values (K, P) a material can have; a column after the other in memory."""
+    """Return which values (K, P) a material can have, column by column in memory."""
     return np.stack([one.physical(values[:, k]) for k, one in enumerate(table)]).T
 
 
@@ -134,10 +135,10 @@ def physical_rows(
     max_unphysical: float,
     notes: list[str],
 ) -> NDArray[np.bool_]:
-    """Return which annotated voxels (K,) are physical; refuse too many others, note a few.
+    """Return which annotated voxels (K,) are physical; note a few others, refuse too many.
 
-    `fine` (K, P) says it of each property. `told` returns, for a row and a column, what lies
-    there in words, and its value in the file.
+    `fine` (K, P) is true for each physical value. `told` takes a row and a column, and returns a
+    description of the value there and the value in the file.
     """
     keep = np.asarray(fine.all(axis=1))
     bad = int(np.count_nonzero(~keep))
@@ -161,7 +162,7 @@ def _require_alike(
     classes: NDArray[np.int64],
     values: NDArray[np.float32],
 ) -> None:
-    """Refuse a voxel that some rows give twice, with other classes or values."""
+    """Refuse rows of the same voxel that differ in class or values."""
     order = rows[np.argsort(flat[rows], kind="stable")]
     twice = np.flatnonzero(np.diff(flat[order]) == 0)
     first, second = order[twice], order[twice + 1]
@@ -185,7 +186,7 @@ def _merged(
         return cells, classes[first], values[first]
     most = int(classes.max(initial=0)) + 1
     parties, votes = np.unique(cell * most + classes, return_counts=True)
-    # Of each cell the class with most votes comes first, of several the lowest.
+    # In each cell the class with most votes comes first, at a tie the lowest.
     parties = parties[np.lexsort((parties, -votes, parties // most))]
     winners = parties[np.searchsorted(parties // most, np.arange(len(cells)))] % most
     counted = classes == winners[cell]

@@ -5,7 +5,7 @@
     {"properties": [{"name": "yield_stress", "unit": "Pa", "scale": "log10"}, ...],
      "classes": ["wood", "steel"], "resolution": 64, "aligned": true}
 
-VoMP's dataset needs none: voxels with materials as a structured array, of meshes without classes.
+VoMP's dataset needs no such file: it has voxels with materials as a structured array, no classes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DESCRIPTION = "source.json"
 _MAX_BYTES = 2**16
 
 _MAX_VOXELS = 2**21
-"""Of one object; all of a grid of 128^3."""
+"""Most voxels of one object: all of a grid of 128^3."""
 
 _COLUMN = files.ArraySpec(shapes=((None,),), kinds="fiu", max_rows=_MAX_VOXELS)
 _VOXELS = files.ArraySpec(shapes=((None, 3),), kinds="fiu", max_rows=_MAX_VOXELS)
@@ -70,7 +70,7 @@ class _Description:
 
     @property
     def table(self) -> tuple[records.Property, ...]:
-        """The properties as records have them."""
+        """The properties, as records."""
         return tuple(
             records.Property(one.name, one.unit, one.scale == "log10", one.least, one.most)
             for one in self.properties
@@ -205,7 +205,7 @@ def _group_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays of a group from the archive of `slatprep.readers.files.load_source`.
 
-    Errors call it `where`. Of the arrays in `empty` chunks may be missing, which then hold the fill
+    Errors call the group `where`. Arrays in `empty` may lack chunks, which then hold the fill
     value. InputError if an array is missing, not as specified, lacks a chunk, or uses another
     compression.
     """
@@ -251,7 +251,7 @@ class VoMP(SourceAdapter):
     patterns = ("voxels/{id}_with_materials.npz", "{id}_with_materials.npz")
 
     def describe(self, source: PixieverseSource) -> Holding:
-        """Say that there are PixieVerse's three properties and no classes."""
+        """Return PixieVerse's three properties and no classes."""
         return Holding(records.PROPERTIES, ())
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
