@@ -15,10 +15,10 @@ _PACKAGES = {
     "small_gicp": ("numpy", "small_gicp"),
     "known": ("numpy", "scipy", "numba"),
 }
-"""The packages that make each engine's numbers."""
+"""Packages that compute each engine's results."""
 
 _EXTRAS = {"open3d": "paper", "small_gicp": "bench"}
-"""Engines that are packages of their own, and the extra that installs each."""
+"""Extra that installs the package of an engine."""
 
 
 def align(
@@ -33,7 +33,7 @@ def align(
     latents : StructuredLatents
         The SLAT side; only its voxels are used.
     parameters : AlignParameters
-        Which engine, and how.
+        The engine and its settings.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def align(
         The transform with its quality and every candidate's score.
     """
     require_engine(parameters)
-    # Imported when first used: Open3D alone takes seconds.
+    # Imported on first use, as importing Open3D takes seconds.
     match parameters.engine:
         case Engine.FIELD:
             from slatprep.align.field import align as align_field
@@ -62,9 +62,10 @@ def align(
 
 
 def require_engine(parameters: AlignParameters) -> None:
-    """Make sure that an engine's package is installed, and Open3D can be loaded.
+    """Check that the engine's package is installed and that Open3D can be loaded.
 
-    ConfigError if it is not; the message says what to install.
+    Raise ConfigError if it is not installed; the message says what to install. Raise SlatprepError
+    if Open3D cannot be loaded.
     """
     extra = _EXTRAS.get(parameters.engine)
     if extra is not None and find_spec(parameters.engine) is None:
@@ -79,9 +80,9 @@ def require_engine(parameters: AlignParameters) -> None:
 
 
 def engine_versions(parameters: AlignParameters) -> dict[str, str]:
-    """Return the versions, by package, of the libraries that make an engine's numbers.
+    """Return the versions, by package, of the libraries that an engine computes with.
 
-    ConfigError if the engine is not installed.
+    Raise ConfigError if the engine is not installed.
     """
     require_engine(parameters)
     versions = {}
@@ -89,5 +90,5 @@ def engine_versions(parameters: AlignParameters) -> dict[str, str]:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            continue  # Open3D goes by two names; one of them is installed.
+            continue  # Open3D has two package names; only one is installed.
     return versions

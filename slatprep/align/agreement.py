@@ -1,7 +1,7 @@
-"""How evenly two surfaces lie on each other: by direction, by block of space, on either side.
+"""Measure how evenly two surfaces fit: by direction, by block of space, and on each side.
 
-Real shapes of one object differ by a lump here and hardly at all elsewhere. Of another object
-nothing fits in most directions. Means over all samples hardly tell the two apart.
+Two shapes of the same object differ in a few places and agree elsewhere. Shapes of two different
+objects disagree in most directions. Means over all samples hardly tell these cases apart.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ BLOCK = 8.0
 """Edge of a block of space, in voxels."""
 
 _LEAST = 12
-"""Samples that a direction must have to be counted."""
+"""Smallest number of samples with which a direction counts."""
 
 _MOST = 4.0
-"""Voxels; by more no direction differs."""
+"""Upper limit, in voxels, of the difference in a direction."""
 
 _AXES = np.array([axes for axes in product((-1.0, 0.0, 1.0), repeat=3) if any(axes)])
 DIRECTIONS: Array = _AXES / np.linalg.norm(_AXES, axis=1, keepdims=True)
@@ -31,8 +31,8 @@ DIRECTIONS: Array = _AXES / np.linalg.norm(_AXES, axis=1, keepdims=True)
 def agreement_of(slat: Array, pixieverse: Array, normals: Array, places: Array) -> Agreement:
     """Measure the agreement of two surfaces.
 
-    `slat` (N,) and `pixieverse` (M,) are residuals in voxels; of their samples together, in this
-    order, `normals` (N+M, 3) are unit vectors and `places` (N+M, 3) in voxels.
+    `slat` (N,) and `pixieverse` (M,) are residuals in voxels. `normals` (N+M, 3), unit vectors, and
+    `places` (N+M, 3), in voxels, belong to the samples of both sides, SLAT first.
     """
     apart = np.abs(np.concatenate([slat, pixieverse]))
     near, middle, counts = _by_direction(apart, normals)
@@ -52,13 +52,13 @@ def agreement_of(slat: Array, pixieverse: Array, normals: Array, places: Array) 
 
 
 def shares_within(apart: Array, *limits: float) -> tuple[float, float, float]:
-    """Return the shares of samples that lie no farther apart (N,) than each of three limits."""
+    """Return the share of the distances `apart` (N,) within each of three limits."""
     near, middle, far = (float((apart <= limit).mean()) for limit in limits)
     return near, middle, far
 
 
 def _by_direction(apart: Array, normals: Array) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Return the 0.3 quantile and the median of what lies apart, and the samples, by direction."""
+    """Return the 0.3 quantile and the median of `apart`, and the sample count, by direction."""
     groups = np.argmax(normals @ DIRECTIONS.T, axis=1)
     counts = np.bincount(groups, minlength=len(DIRECTIONS))
     if counts.max() < _LEAST:
@@ -71,16 +71,16 @@ def _by_direction(apart: Array, normals: Array) -> tuple[Array, Array, NDArray[n
 
 
 def blocks_of(places: Array) -> NDArray[np.intp]:
-    """Number the blocks of space that have samples; return that of each of the places (N, 3)."""
+    """Return the number (N,) of the block of space in which each of the places (N, 3) lies."""
     cells = np.floor(places / BLOCK).astype(np.intp)
     cells -= cells.min(axis=0)
-    # Far more than blocks a side, so that no two blocks have one number.
+    # The factors exceed the number of blocks along an axis, so each block has its own number.
     numbers = cells @ np.array([1 << 32, 1 << 16, 1])
     return np.unique(numbers, return_inverse=True)[1].reshape(-1)
 
 
 def _by_block(apart: Array, places: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Return the median of what lies apart in each block of space, and its samples."""
+    """Return the median of `apart` and the sample count in each block of space."""
     groups = blocks_of(places)
     counts = np.bincount(groups)
     order, first = _sorted_by(groups, apart, counts)
@@ -91,5 +91,5 @@ def _by_block(apart: Array, places: Array) -> tuple[Array, NDArray[np.intp]]:
 def _sorted_by(
     groups: NDArray[np.intp], values: Array, counts: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the order of `values` by group and in each by size, and where groups begin."""
+    """Return the order of `values` by group and then by size, and each group's first index."""
     return np.lexsort((values, groups)), np.cumsum(counts) - counts

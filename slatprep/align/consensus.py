@@ -1,12 +1,10 @@
 """Settle ambiguous assets by the orientation that the rest of the dataset shares.
 
-Both pipelines have a habitual frame, so most assets of a dataset are turned the
-same way. Where an asset's geometry cannot tell placements apart, the clear
-winners of its dataset can: among its tied placements the one nearest to their
-common rotation is taken. An asset that is turned otherwise without a tie is fitted
-in the common rotation as well, and what the shapes say is weighed against how rare
-other rotations are. The placement that was left is kept among the placements, so
-that the choice can be undone.
+Both pipelines have a habitual frame, so most assets of a dataset have the same rotation. If an
+asset's geometry leaves placements tied, the tied placement nearest to the rotation of the clear
+winners is taken. An asset without a tie but with another rotation is also fitted in the common
+rotation. The score of that fit is weighed against how rare other rotations are. The old placement
+stays among the placements, so the choice can be undone.
 """
 
 from __future__ import annotations
@@ -33,23 +31,23 @@ from slatprep.records import (
 
 LEAST_WINNERS = 5
 LEAST_SHARE = 0.5
-"""A rotation is common if so many clear winners, and this share of them, have it."""
+"""Smallest number, and smallest share, of the clear winners that have a common rotation."""
 
 TEMPERATURE = 0.02
-"""A placement that scores so much higher, once deformed, is e times as likely the right one."""
+"""Rise of the score, after deformation, that makes a placement e times as likely."""
 
 SURE = 0.95
-"""From this probability on an asset without a tie is turned as the dataset is."""
+"""Smallest probability at which an asset without a tie takes the common rotation."""
 
 NEAR_DEGREES = 30.0
-"""Rotations this near to a quarter turn count as that quarter turn."""
+"""Largest angle, in degrees, between two rotations that count as the same quarter turn."""
 
 
 def find_consensus(transforms: ArrayLike) -> Consensus | None:
     """Find the rotation that clear winners have in common, from their transforms (A, 4, 4).
 
-    It is the mean of the rotations near the most frequent quarter turn. None where fewer than
-    `LEAST_WINNERS` assets or less than `LEAST_SHARE` of them agree.
+    It is the mean of the rotations near the most frequent quarter turn. Return None if
+    fewer than `LEAST_WINNERS` assets, or less than `LEAST_SHARE` of them, agree.
     """
     linear = np.asarray(transforms, np.float64).reshape(-1, 4, 4)[:, :3, :3]
     rotations = linear / np.cbrt(np.linalg.det(linear))[:, None, None]
@@ -71,7 +69,7 @@ def find_consensus(transforms: ArrayLike) -> Consensus | None:
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
     """Choose, among tied placements, the one nearest to the common rotation.
 
-    Returns the same object where nothing is tied, or none of them is turned as the dataset is.
+    Return the same object if nothing is tied or no tied placement has the common rotation.
     """
     if not alignment.placements:
         return alignment
@@ -83,7 +81,7 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
     prior, rare = _shares_of(consensus)
     odds = [prior if angle <= NEAR_DEGREES else rare for angle in angles]
     scores = np.array([tie.score for tie in ties])
-    # An engine that ranks by fitness alone has no scores: NaN.
+    # The score is NaN for an engine that ranks by fitness alone.
     likely = odds * np.exp(np.nan_to_num(scores - scores[chosen]) / TEMPERATURE)
     by = replace(consensus, probability=float(odds[chosen] / likely.sum()))
     if chosen == 0:
@@ -98,13 +96,13 @@ def turn_if_likelier(
     consensus: Consensus,
     parameters: AlignParameters,
 ) -> Alignment:
-    """Choose the common rotation for an asset that is turned otherwise, if that is likelier.
+    """Choose the common rotation for an asset with another rotation, if that is likelier.
 
-    The odds are those of the shapes, by how much better the asset fits once deformed
-    (`TEMPERATURE`), times those of the dataset: how frequent the common rotation is, and any
-    other quarter turn. It takes `SURE` to change a placement.
+    The odds are a product of two factors. One is how much better the asset fits in the common
+    rotation once deformed (`TEMPERATURE`). The other is how frequent the common rotation and any
+    other quarter turn are in the dataset. A placement changes only from probability `SURE` on.
 
-    Returns the same object where the choice stands.
+    Return the same object if the placement stays.
     """
     if alignment.engine is not Engine.FIELD or is_common(alignment.transform, consensus):
         return alignment
@@ -121,34 +119,34 @@ def turn_if_likelier(
 
 
 def is_common(transform: ArrayLike, consensus: Consensus) -> bool:
-    """Whether a transform (4, 4) turns as the dataset does."""
+    """Return whether a transform (4, 4) has the common rotation."""
     return bool(degrees_between(split_transform(transform)[0], consensus.rotation) <= NEAR_DEGREES)
 
 
 def probability_of_common(consensus: Consensus, gain: float) -> float:
-    """Return how likely the common rotation is for an asset, of it and one other quarter turn.
+    """Return the probability of the common rotation against one other quarter turn.
 
-    `gain` is how much higher the asset scores in the common rotation, once deformed.
+    `gain` is the rise of the asset's score in the common rotation, after deformation.
     """
     common, other = _shares_of(consensus)
     return 1.0 / (1.0 + other / common * math.exp(min(-gain / TEMPERATURE, 700.0)))
 
 
 def _shares_of(consensus: Consensus) -> tuple[float, float]:
-    """Return how frequent the common rotation is in the dataset, and any other quarter turn."""
-    # One more that disagrees, so that no other rotation is impossible.
+    """Return the frequency in the dataset of the common and of each other quarter turn."""
+    # One more asset is counted as disagreeing, so that no rotation has probability 0.
     common = consensus.agreeing / (consensus.winners + 1)
     return common, (1.0 - common) / (len(distinct_starts()) - 1)
 
 
 def degrees_between(rotation: ArrayLike, other: ArrayLike) -> Any:
-    """Return the angle, in degrees, of the turn from one rotation (3, 3) or several to another."""
+    """Return the angle, in degrees, between one rotation (3, 3) or several and another."""
     trace = np.sum(np.asarray(rotation) * np.asarray(other), axis=(-2, -1))
     return np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
 def _mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Chordal mean: the rotation nearest to the mean matrix."""
+    """Return the chordal mean: the rotation nearest to the mean matrix."""
     # Summed in sorted order: the mean must not depend on the order of assets.
     ordered = sorted(rotations, key=lambda rotation: rotation.tobytes())
     u, _, v = np.linalg.svd(np.mean(ordered, axis=0))

@@ -1,8 +1,8 @@
-"""Deformation that must be earned: an affine map, then a lattice, after a similarity.
+"""Fit a deformation after a similarity, and keep it only if held-out samples support it.
 
-A trial fit sees the samples of every other block of space, and each further
-freedom is kept only if it raises the score in the blocks between. A smooth
-difference of shapes continues from block to block; a field's roughness does not.
+A trial fit uses the samples of every other block of space. An affine map, and then a lattice, is
+kept only if it raises the score in the blocks between. A smooth difference of shapes continues from
+block to block; a field's roughness does not.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model
 
 TRIAL_SAMPLES = 600
-"""Samples a side of the trial; half of them are held out."""
+"""Samples per side of the trial; half of them are held out."""
 
 AFFINE_TAUS = (4.0, 3.0, 3.0, 2.0, 2.0, 1.5, 1.5, 1.5)
 TRIAL_TAUS = (2.5, 2.0, 2.0, 1.5)
 LATTICE_TAUS = ((2.0, 1.5), (1.5, 1.5), (1.5, 1.5))
-"""Width of the robust kernel, in voxels, at each step: affine, then the coarsest lattice of a
-trial, then lattice by lattice."""
+"""Width of the robust kernel, in voxels, at each step: of the affine map, of the coarsest lattice
+in a trial, and of each lattice of the final fit."""
 
 FITS_ANYWAY = 0.9
-"""A similarity that scores this much leaves too little to ask for a deformation."""
+"""Score of a similarity at and above which no deformation is tried."""
 
 CLEAN = 0.8
-"""From this score on the fields are not rough, and half of a trial's samples will do."""
+"""Smallest score of fields that are not rough; a trial then needs only half of its samples."""
 
 LEAST_GAIN, GAIN_SHARE = 0.01, 0.1
-"""A deformation is kept that raises the score of unseen blocks by so much and by this share of
-the misfit."""
+"""A deformation must raise the score of unseen blocks by more than the first number plus the second
+times the misfit."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial fit: warps with an affine part only and with a coarse lattice, and their scores.
+    """A trial fit: a warp with an affine part only, a warp with a coarse lattice, and their scores.
 
-    ``scores`` are of the similarity, the affine and the bent warp on the
-    samples that the trial did not see; ``whole`` is the bent one's on all.
+    ``scores`` are those of the similarity, the affine and the bent warp on the samples that the
+    trial did not see. ``whole`` is the score of the bent warp on all samples.
     """
 
     affine: Warp
@@ -54,7 +54,7 @@ class Trial:
 
 
 def try_out(slat: Surface, pixie: Surface, pose: Similarity, samples: int = TRIAL_SAMPLES) -> Trial:
-    """Fit on the samples of every other block, and score on the others."""
+    """Fit to the samples of every other block of space, and score on the other samples."""
     residuals = Residuals(slat, pixie, pose, samples)
     start = Warp.unbent(pose)
     unseen = residuals.held_out()
@@ -71,9 +71,10 @@ def try_out(slat: Surface, pixie: Surface, pose: Similarity, samples: int = TRIA
 
 @dataclass(frozen=True)
 class Deformed:
-    """What came of it: the similarity, the model, the deformation (None without) and figures.
+    """A similarity with its model, the deformation that was kept, and figures.
 
-    ``warp`` is the deformation as it is fitted, and leaves all where it is without one.
+    ``warp`` is the deformation in the form in which it is fitted. If no deformation was kept,
+    ``deformation`` is None and ``warp`` moves nothing.
     """
 
     pose: Similarity
@@ -86,10 +87,11 @@ class Deformed:
 def deform_if_earned(
     slat: Surface, pixie: Surface, pose: Similarity, model: Model, parameters: AlignParameters
 ) -> Deformed:
-    """Deform a similarity as far as the parameters allow and the evidence asks.
+    """Add a deformation to a similarity if parameters and evidence allow it.
 
-    `model` says whether its scale is one. Of the parameters, the model ``auto`` lets the evidence
-    decide, ``affine`` and ``deformable`` fit that without asking, the others nothing.
+    `model` is the model without a deformation: rigid or similarity. If `parameters.model` is
+    ``auto``, the evidence decides. If it is ``affine`` or ``deformable``, that is fitted in any
+    case; otherwise nothing is fitted.
     """
     residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
     start = Warp.unbent(pose)
@@ -98,11 +100,11 @@ def deform_if_earned(
     wanted: str = parameters.model if parameters.model in ("affine", "deformable") else ""
     warp, kept = start, None
     if wanted or (parameters.model == "auto" and before < FITS_ANYWAY):
-        # Clean sides speak clearly: half of the samples say as much.
+        # On smooth fields half of the samples are enough.
         trial = try_out(slat, pixie, pose, TRIAL_SAMPLES if before < CLEAN else TRIAL_SAMPLES // 2)
         evidence = trial.scores[1] - trial.scores[0], trial.scores[2] - trial.scores[1]
         wanted = wanted or earned(trial)
-        # What bends too far or folds may still be stretched.
+        # If the lattice bends too far or folds, an affine map may still be valid.
         for tried in {"": (), "affine": ("affine",)}.get(wanted, ("deformable", "affine")):
             warp, nearest = fit(slat, pixie, pose, trial, tried), pose
             kept = warp.record(slat.points, parameters.max_displacement)
@@ -122,10 +124,10 @@ def deform_if_earned(
 
 
 def earned(trial: Trial) -> str:
-    """Return ``affine`` or ``deformable`` where the unseen blocks ask for it; else nothing.
+    """Return ``affine`` or ``deformable`` if the unseen blocks support it, else an empty string.
 
-    What is asked for is a tenth of the misfit. An affine map that took that
-    away is kept also where bending it adds nothing.
+    The score must rise by more than `LEAST_GAIN` plus a tenth of the misfit. An affine map that
+    achieves this is kept even if bending adds nothing.
     """
     before, affine, bent = trial.scores
     margin = LEAST_GAIN + GAIN_SHARE * (1.0 - before)
@@ -135,7 +137,7 @@ def earned(trial: Trial) -> str:
 
 
 def fit(slat: Surface, pixie: Surface, pose: Similarity, trial: Trial, model: str) -> Warp:
-    """Fit an ``affine`` or ``deformable`` warp on all samples, from where a trial ended."""
+    """Fit an ``affine`` or ``deformable`` warp to samples of all blocks, from a trial's warp."""
     residuals = Residuals(slat, pixie, pose, FIT_SAMPLES)
     everything = np.arange(len(residuals.places))
     if model == "affine":

@@ -1,15 +1,15 @@
 """Robust Gauss-Newton for a deformation between two distance fields; compiled inner loops.
 
-A SLAT point x is looked up at T^-1 g(x), g(x) = A x + b + u(x) with a spline
-displacement u (`bspline`). With the fields f_S and f_P, the scale s and offset
+A SLAT point x corresponds to the PixieVerse point T^-1 g(x), with g(x) = A x + b + u(x)
+and a spline displacement u (`bspline`). With the fields f_S and f_P, the scale s and offset
 o of the similarity T (see `solver`), the residuals are
 
     r = s f_P(T^-1 g(x)) - f_S(x) - o     at SLAT samples x,
     r = f_S(g^-1(T y)) - s f_P(y) + o     at PixieVerse samples y.
 
-A sample's derivative by the coefficients is one vector times its 64 weights, so
-the normal equations are never formed: conjugate gradients apply them sample by
-sample, always in the same order.
+The derivative of a residual with respect to the coefficients is one vector times 64 weights. So the
+normal matrix is never formed: conjugate gradients apply it sample by sample, always in the same
+order.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from slatprep.geometry.kernel import kernel
 
 OFFSET_PRIOR = 0.01
 PIXIEVERSE_WEIGHT = 0.5
-"""Weight of a PixieVerse sample in a fit: floaters and ground are surface that only they have."""
+"""Weight of a PixieVerse sample in a fit; low, as only this side has floaters and ground."""
 
 _INVERSE_STEPS = 2
 
 
 class Lines(NamedTuple):
-    """What the equations of a lattice know of each of M samples; kernels write it."""
+    """The data of M samples in the equations of a lattice; kernels write them."""
 
-    places: NDArray[np.float64]  # (M, 3), where it lies in the SLAT frame
-    bases: NDArray[np.uint64]  # (M,), its first control point
-    weights: NDArray[np.float64]  # (M, 12), of its control points along each axis
+    places: NDArray[np.float64]  # (M, 3), positions in the SLAT frame
+    bases: NDArray[np.uint64]  # (M,), flat index of the first control point
+    weights: NDArray[np.float64]  # (M, 12), of four control points along each axis
     vectors: NDArray[np.float64]  # (M, 4), weighted derivatives by displacement and offset
     residuals: NDArray[np.float64]  # (M,), weighted
 
     @classmethod
     def at(cls, places: NDArray[np.float64]) -> Lines:
-        """Return empty lines of samples at these places."""
+        """Return lines for samples at `places` (M, 3), with all other numbers unset."""
         n = len(places)
         return cls(places, np.empty(n, np.uint64), np.empty((n, 12)), np.empty((n, 4)), np.empty(n))
 
     def rows(self, chosen: slice | NDArray[np.intp]) -> Lines:
-        """Return some rows; a slice shares memory."""
+        """Return the chosen rows; a slice shares memory."""
         return Lines._make(numbers[chosen] for numbers in self)
 
 
@@ -55,9 +55,9 @@ class Lines(NamedTuple):
 def linearise(here, there, pose, warp, lines, forward, tau):  # type: ignore[no-untyped-def]
     """Linearise one side's residuals at the current deformation.
 
-    `here` and `there` are `Samples`, `pose` is a `Similarity` and `warp` a `Warp`. Where not
-    `forward` the `lines`' places are improved first: a few steps of a fixed-point iteration
-    from the last known place. Where the warp has no lattice it is not looked at.
+    `here` and `there` are `Samples`, `pose` is a `Similarity` and `warp` a `Warp`. If not
+    `forward`, the `lines`' places are improved first, by a fixed-point iteration from the last
+    known places. If the warp has no lattice, its coefficients are not used.
     """
     columns, values, field, field_origin = here.columns, here.values, there.distance, there.origin
     places, bases, weights = lines.places, lines.bases, lines.weights
@@ -148,10 +148,10 @@ def _apply(bases, weights, vectors, delta, delta_offset, strength, damping, out)
 
 @kernel()
 def lattice_step(lines, coefficients, offset, strength, damping, offset_prior, iterations):  # type: ignore[no-untyped-def]
-    """One Gauss-Newton step of all coefficients and the offset, by conjugate gradients.
+    """Take one Gauss-Newton step of all coefficients and the offset, by conjugate gradients.
 
-    Adds the step to `coefficients` and returns the new offset. The
-    preconditioner is the matrix's diagonal.
+    Add the step to `coefficients` and return the new offset. The preconditioner is the
+    matrix's diagonal.
     """
     bases, weights, vectors, residuals = lines.bases, lines.weights, lines.vectors, lines.residuals
     shape = coefficients.shape
@@ -171,7 +171,7 @@ def lattice_step(lines, coefficients, offset, strength, damping, offset_prior, i
     bend(coefficients, strength, gradient)
     for k in range(size):
         g[k] += damping * coefficients.reshape(-1)[k]
-        # An inner control point takes part in 3 * (1 + 4 + 1) + 2 * 3 * 4 squares.
+        # The bending energy's diagonal at an inner point is 3 * (1 + 4 + 1) + 2 * 3 * 4.
         d[k] += 42.0 * strength + damping
     delta, direction, product = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     x, p, q = delta.reshape(-1), direction.reshape(-1), product.reshape(-1)

@@ -1,14 +1,14 @@
 """Normal equations of a fit between two distance fields; the compiled inner loop.
 
-A SLAT sample looks the PixieVerse distance up, and the other way round; `Link` says where.
-With the residuals r and their derivatives J, the rows A = (J, r), and W the squared kernels
-1 / (1 + r^2 / tau^2) of Geman and McClure, the equations are A^T W A: the normal matrix, and
-beside it, as the last column, the right-hand side.
+Each SLAT sample reads the PixieVerse distance field, and each PixieVerse sample the SLAT's; `Link`
+gives the positions. r are the residuals, J their derivatives and A = (J, r) the rows. W are the
+squared Geman-McClure kernels 1 / (1 + r^2 / tau^2). The equations are A^T W A: the normal matrix,
+with the negative right-hand side as the last column.
 
-With g the derivative of a residual by where the deformed SLAT point lies, and q the sample's
-place from the centre, J is g q^T and g for an affine map of the SLAT's side, twelve unknowns row
-by row, and -(q x g), -g, -(q . g) for a turn, shift and growth of the PixieVerse side; behind
-them the offset.
+g is the derivative of a residual with respect to the position of the deformed SLAT point, and q the
+sample's position from the centre. For an affine map of the SLAT side, J is g q^T and g: twelve
+unknowns, row by row. For a rotation, shift and growth of the PixieVerse side, J is -(q x g), -g and
+-(q . g). The offset is the last unknown of both.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from slatprep.geometry.kernel import kernel
 SIMILARITY = 8  # unknowns: turn 3, shift 3, log scale, offset
 AFFINE = 13  # unknowns: nine of the matrix and three of the shift, row by row, and the offset
 
-_BLOCK = 64  # samples a step at a time: what is kept of them stays in the processor's first cache
-_LANES = 8  # sums of each product, of every eighth sample each: as many on any processor
-_STEP = 16  # samples whose products are added to the sums at once, before these are stored again
+_BLOCK = 64  # samples processed at a time; their data stay in the first-level cache
+_LANES = 8  # partial sums of each product, over every eighth sample; the same on any processor
+_STEP = 16  # samples that are added to the partial sums before these are stored again
 _FEW = ((0, 0), (0, 3), (0, 6), (3, 3), (3, 6), (6, 6))
 _MANY = (*_FEW, (0, 9), (0, 12), (3, 9), (3, 12), (6, 9), (6, 12), (9, 9), (9, 12), (12, 12))
 # First row and column of each block of three by three products in the upper triangle.
-_SIZE = 15  # rows of A, the unknowns and the residual, in whole blocks
+_SIZE = 15  # rows of A (unknowns and residual), rounded up to blocks of three
 _VALUE, _GX, _GY, _GZ, _U, _V, _W, _X, _Y, _Z, _OX, _OY, _OZ, _BEYOND, _ROWS = range(
     0, 15 * _BLOCK, _BLOCK
 )
 _SUMS = _ROWS + _SIZE * _BLOCK
 _NUMBERS = _SUMS + 9 * len(_MANY) * _LANES
-"""How many numbers a block has, and before it where those of each kind begin: in one array, which
-is no other's memory, so that the compiler makes vector instructions of the loops over them."""
+"""Length of a block's array; the names before it are offsets of its parts. One array that overlaps
+no other lets the compiler vectorise the loops."""
 
 
 class Link(NamedTuple):
-    """Where one side's samples look the other side's distance up.
+    """The map from one side's samples to positions in the other side's distance field.
 
-    The map (3, 3), (3,) leads a SLAT sample (`forward`) to the PixieVerse frame, a PixieVerse
-    sample to the SLAT frame; `turn` (3, 3) makes g of the gradient found there.
+    `matrix` (3, 3) and `shift` (3,) map a SLAT sample to the PixieVerse frame if `forward`, else a
+    PixieVerse sample to the SLAT frame. `turn` (3, 3) converts the gradient there to g.
     """
 
     matrix: NDArray[np.float64]
@@ -56,7 +56,7 @@ class Link(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """Equations of which the upper triangle counts, and the memory of a block while they grow."""
+    """The equations (`products`, upper triangle only), and the work arrays of one block."""
 
     products: NDArray[np.float64]
     block: NDArray[np.float64]
@@ -66,7 +66,7 @@ class Equations(NamedTuple):
 
 @kernel(inline="always", error_model="numpy")
 def trilinear(f000, f001, f010, f011, f100, f101, f110, f111, u, v, w):  # type: ignore[no-untyped-def]
-    """Value and gradient at (u, v, w) in a cell, from its corners."""
+    """Return the value and gradient at (u, v, w) in a cell, from its corners."""
     f00 = f000 + (f001 - f000) * w
     f01 = f010 + (f011 - f010) * w
     f10 = f100 + (f101 - f100) * w
@@ -81,12 +81,12 @@ def trilinear(f000, f001, f010, f011, f100, f101, f110, f111, u, v, w):  # type:
 
 @kernel(inline="always", error_model="numpy")
 def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
-    """Trilinear value and gradient; outside the box the distance to it is added."""
+    """Return the trilinear value and gradient; outside the box, add the distance to it."""
     n0, n1, n2 = f.shape
     cx = min(max(x, 0.0), n0 - 1.000001)
     cy = min(max(y, 0.0), n1 - 1.000001)
     cz = min(max(z, 0.0), n2 - 1.000001)
-    # Unsigned, so that no negative index has to be provided for.
+    # Unsigned, so that the compiler need not handle negative indices.
     i, j, k, one = np.uint64(cx), np.uint64(cy), np.uint64(cz), np.uint64(1)
     u, v, w = cx - np.float64(i), cy - np.float64(j), cz - np.float64(k)
     f000, f001, f010, f011 = f[i, j, k], f[i, j, k + one], f[i, j + one, k], f[i, j + one, k + one]
@@ -104,7 +104,7 @@ def interpolate(f, x, y, z):  # type: ignore[no-untyped-def]
 
 @kernel()
 def new_equations():  # type: ignore[no-untyped-def]
-    """Return equations of nothing."""
+    """Return equations of zeros, with work arrays."""
     cells, corners = np.empty(_BLOCK, np.int64), np.empty(8 * _BLOCK, np.float32)
     return Equations(np.zeros((_SIZE, _SIZE)), np.empty(_NUMBERS), cells, corners)
 
@@ -129,9 +129,9 @@ def accumulate(here, there, link, centre, tau, weight, unknowns, equations):  # 
 
 @kernel(error_model="numpy")
 def fit_of(here, there, link, equations):  # type: ignore[no-untyped-def]
-    """Of one side at tau = 1, the summed kernel, and the number and squares of the inliers.
+    """Return one side's kernel sum at tau = 1, its inlier count and the inliers' sum of squares.
 
-    `equations` only lends its memory.
+    Only the work arrays of `equations` are used.
     """
     block = equations.block
     kernels, inliers, sum_of_squares = 0.0, 0, 0.0
@@ -149,7 +149,7 @@ def fit_of(here, there, link, equations):  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _residuals_of(columns, first, values, link, there, tau, equations):  # type: ignore[no-untyped-def]
-    """Set a block's residuals, and all that is known of them, from the number `first` on."""
+    """Compute the residuals, gradients and kernels of a block of samples from `first` on."""
     block, cells = equations.block, equations.cells
     _carry(columns, first, len(values), link, there, block, cells)
     _look_up(there.distance, cells, len(values), equations.corners, block)
@@ -158,8 +158,8 @@ def _residuals_of(columns, first, values, link, there, tau, equations):  # type:
 
 @kernel(error_model="numpy")
 def _carry(columns, first, count, link, there, block, cells):  # type: ignore[no-untyped-def]
-    """Find the points in the SLAT frame, and their cells and places in the other side's field."""
-    # Out of the loop, as the compiler cannot know that what it writes is not one of these.
+    """Compute positions in the SLAT frame, and cells and positions in the other side's field."""
+    # Read before the loop, as the compiler cannot know that the loop does not overwrite them.
     matrix, shift, origin = link.matrix, link.shift, there.origin
     m00, m01, m02, s0 = matrix[0, 0], matrix[0, 1], matrix[0, 2], shift[0]
     m10, m11, m12, s1 = matrix[1, 0], matrix[1, 1], matrix[1, 2], shift[1]
@@ -192,11 +192,11 @@ def _carry(columns, first, count, link, there, block, cells):  # type: ignore[no
 
 @kernel(error_model="numpy")
 def _look_up(field, cells, count, corners, block):  # type: ignore[no-untyped-def]
-    """Do what `interpolate` does for a block; as vectors but for the reading of the corners."""
+    """Do what `interpolate` does for a block; all but the reading of corners is vectorised."""
     values, row = field.reshape(-1), field.shape[2]
     plane = field.shape[1] * row
     for m in range(count):
-        # Unsigned, so that no negative index has to be provided for.
+        # Unsigned, so that the compiler need not handle negative indices.
         for corner in range(8):
             step = (corner >> 2) * plane + (corner >> 1 & 1) * row + (corner & 1)
             corners[corner * _BLOCK + m] = values[np.uint64(cells[m] + step)]
@@ -222,7 +222,7 @@ def _look_up(field, cells, count, corners, block):  # type: ignore[no-untyped-de
 
 @kernel(error_model="numpy")
 def _weigh(values, link, tau, block):  # type: ignore[no-untyped-def]
-    """Set a block's residuals, their kernels (U) and their squares (V)."""
+    """Compute a block's residuals, their kernels (`_U`) and their squares (`_V`)."""
     scale, offset = link.scale, link.offset
     if link.forward:
         for m in range(len(values)):
@@ -237,7 +237,7 @@ def _weigh(values, link, tau, block):  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _linearise(count, link, centre, weight, block):  # type: ignore[no-untyped-def]
-    """Set a block's g and q, and W (U); weights and rows of zeros make it as long as a step."""
+    """Compute a block's g, q and W (`_U`); pad weights and rows with zeros to a whole step."""
     turn = link.turn
     r00, r01, r02 = turn[0, 0], turn[0, 1], turn[0, 2]
     r10, r11, r12 = turn[1, 0], turn[1, 1], turn[1, 2]
@@ -261,7 +261,7 @@ def _linearise(count, link, centre, weight, block):  # type: ignore[no-untyped-d
 
 @kernel(error_model="numpy")
 def _rows_of_similarity(count, forward, block):  # type: ignore[no-untyped-def]
-    """Set a block's rows of A."""
+    """Compute a block's rows of A for a similarity."""
     sign = -1.0 if forward else 1.0
     for m in range(count):
         gx, gy, gz = block[_GX + m], block[_GY + m], block[_GZ + m]
@@ -279,7 +279,7 @@ def _rows_of_similarity(count, forward, block):  # type: ignore[no-untyped-def]
 
 @kernel(error_model="numpy")
 def _rows_of_affine(count, forward, block):  # type: ignore[no-untyped-def]
-    """Do the same for an affine map; its last row is of zeros."""
+    """Compute a block's rows of A for an affine map; the last row is zero."""
     sign = -1.0 if forward else 1.0
     for m in range(count):
         gx, gy, gz = block[_GX + m], block[_GY + m], block[_GZ + m]
@@ -303,10 +303,10 @@ def _rows_of_affine(count, forward, block):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _add_products(count, unknowns, block):  # type: ignore[no-untyped-def]
-    """Add a block's products to their sums; of the symmetric matrix the upper triangle alone."""
+    """Add a block's products to their sums, for the upper triangle of the symmetric matrix."""
     for first in range(0, _BLOCK, _STEP):
-        # Not the end of the range: the compiler would have to expect a negative `first`, and
-        # a check of each index keeps it from vector instructions.
+        # With a range up to `count` the compiler would expect a negative `first`, and a check of
+        # each index would prevent vectorisation.
         if first >= count:
             break
         _add_nine_products(block, first, 0, 0, 0)
@@ -329,9 +329,9 @@ def _add_products(count, unknowns, block):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def _add_nine_products(block, first, row, column, number):  # type: ignore[no-untyped-def]
-    """Add those of three rows of W A and three of A, `row` and `column` the first of them.
+    """Add the products of three rows of W A, from `row` on, and three of A, from `column` on.
 
-    Written out, and the numbers constants, so that the compiler makes vectors of the lanes.
+    They are written out, with constant numbers, so that the compiler vectorises the lanes.
     """
     left, right = _ROWS + row * _BLOCK + first, _ROWS + column * _BLOCK + first
     for lane in range(_LANES):
@@ -354,7 +354,7 @@ def _add_nine_products(block, first, row, column, number):  # type: ignore[no-un
 
 @kernel()
 def _add_sums(blocks, block, products):  # type: ignore[no-untyped-def]
-    """Add up the lanes, and add the sums to the upper triangle of all products."""
+    """Add up the lanes, and add the sums to the upper triangle of `products`."""
     for number in range(9 * blocks):
         at = _SUMS + number * _LANES
         even = (block[at] + block[at + 4]) + (block[at + 2] + block[at + 6])
@@ -371,7 +371,7 @@ def _add_sums(blocks, block, products):  # type: ignore[no-untyped-def]
 
 @kernel()
 def centre_of(samples):  # type: ignore[no-untyped-def]
-    """Return the mean place (3,) of samples."""
+    """Return the mean position (3,) of the samples."""
     centre = np.zeros(3)
     for axis in range(3):
         for place in samples.columns[axis]:
@@ -381,7 +381,7 @@ def centre_of(samples):  # type: ignore[no-untyped-def]
 
 @kernel()
 def matrix_and_rhs(products, unknowns, normal, rhs):  # type: ignore[no-untyped-def]
-    """Take the equations apart into the whole normal matrix and the right-hand side."""
+    """Write the full normal matrix to `normal` and the right-hand side to `rhs`."""
     for i in range(unknowns):
         rhs[i] = -products[i, unknowns]
         for j in range(unknowns):
@@ -392,8 +392,8 @@ def matrix_and_rhs(products, unknowns, normal, rhs):  # type: ignore[no-untyped-
 def solve_linear(matrix, rhs, step):  # type: ignore[no-untyped-def]
     """Solve ``matrix @ step = rhs`` by elimination with partial pivoting, in place.
 
-    A dozen unknowns take less time here than calling LAPACK does, and the bits
-    do not depend on which kernels a BLAS picks for the processor.
+    For a dozen unknowns this is faster than a call of LAPACK. The bits do not depend on
+    the kernels that a BLAS picks for the processor.
     """
     n = len(rhs)
     for i in range(n):
@@ -418,7 +418,7 @@ def solve_linear(matrix, rhs, step):  # type: ignore[no-untyped-def]
 
 @kernel()
 def invert(affine, inverse):  # type: ignore[no-untyped-def]
-    """Write the inverse of the 3x3 part; return the determinant."""
+    """Write the inverse of the 3x3 part to `inverse`; return the determinant."""
     for i in range(3):
         for j in range(3):
             k, n, u, v = (j + 1) % 3, (j + 2) % 3, (i + 1) % 3, (i + 2) % 3

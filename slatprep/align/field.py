@@ -1,19 +1,20 @@
-"""The default engine: two filled voxel sets laid on each other by their distance fields.
+"""The default engine: align two filled voxel sets by their distance fields.
 
-The method in six steps (docs/design/alignment.md has the equations):
+The method has six steps (docs/design/alignment.md has the equations):
 
 1. Fill both voxel sets and measure the signed distance to their surfaces.
-2. From each of the 24 distinct start rotations, centroid on centroid and size
-   on size, a few robust Gauss-Newton steps on a few hundred samples.
-3. Polish the distinct survivors on more samples; where the best one fits
-   poorly, search all orientations the same way.
-4. Refine what is left on all samples, choose the best, list the ties.
-5. Keep the scale at one where the data do not ask for another.
-6. Where a tenth of the misfit goes away in samples that a trial fit did not
-   see, deform: `slatprep.align.deform`; and then those that tie as well.
+2. Start from each of the 24 distinct rotations, centroid on centroid and size
+   on size. Take a few robust Gauss-Newton steps on 100 samples per side.
+3. Polish the distinct survivors on more samples. If the best one fits poorly,
+   search all orientations the same way.
+4. Refine the remaining placements on 2,000 samples per side, choose the best,
+   and list the ties.
+5. Keep the scale at one if that fits about as well.
+6. If a trial fit removes a tenth of the misfit in samples that it did not see,
+   deform the best placement and its near ties: `slatprep.align.deform`.
 
-Where the field has a slab of ground that the SLAT lacks, all of it once more
-without that: `slatprep.align.ground`. The steps are methods of `slatprep.align.pair.Pair`.
+If the field has a slab of ground that the SLAT lacks, the steps run again
+without the slab: `slatprep.align.ground`. The steps are methods of `slatprep.align.pair.Pair`.
 """
 
 from __future__ import annotations
@@ -52,25 +53,26 @@ from slatprep.records import (
 )
 
 POOR, FAIR, CLEAR = 0.8, 0.9, 0.1
-"""All orientations are searched if the best score from the 24 starts is poor, or if it is
-no better than fair and not clearly above that of the next distinct placement."""
+"""All orientations are searched if the best score from the 24 starts is below `POOR`. They are also
+searched if it is below `FAIR` and less than `CLEAR` above the next distinct placement's."""
 
 HOPELESS = 0.1
-"""Sides whose best score is lower have no shape in common, deformed or without ground."""
+"""Best score up to which the sides have no shape in common, even if deformed or without ground."""
 
 WIDER_GAIN = 0.02
-"""By so much a placement far from the quarter turns must score above the best near them."""
+"""Rise of the score by which a placement from all orientations must beat the 24 starts."""
 
 CLOSE = 0.02
-"""Deformed placements tie if they score less than this below the best, as scores tell more then."""
+"""Difference to the best score below which deformed placements tie; here scores are more
+precise."""
 
 CLEARLY = 2.5
-"""A placement that fits worse by so many standard errors does not tie, however close it scores;
-one that fits better by any number does, where it was asked."""
+"""Number of standard errors at which a placement that fits worse stops tying, however close it
+scores. A placement that fits better ties whatever its score, if this was measured."""
 
 
 class Candidates(NamedTuple):
-    """Placements best first, of the 24 starts as they were fitted, and of all orientations."""
+    """Placements best first, the fits of the 24 starts, and poses of all orientations."""
 
     poses: list[Pose]
     fits: list[Pose]
@@ -88,7 +90,7 @@ def align(
 
 
 def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignment:
-    """Return the alignment without a flat layer that fits best, if it is clearly better."""
+    """Return the best alignment without a flat layer if it is clearly better, else `found`."""
     best, most = found, LEAST_GAIN
     for ground in (raised(layer, by) for layer in find_layers(pair.pixie) for by in RAISED):
         solid = above(field.occupancy, ground)
@@ -99,7 +101,7 @@ def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignme
         if candidates.poses[0].score < found.score:
             continue
         without = replace(_alignment(there, candidates), ground=ground)
-        # What came out ahead of the search may fall behind when it is finished.
+        # A placement that leads after the search may score less once it is finished.
         if without.score >= found.score and (rise := gain(without, found)) > most:
             best, most = without, rise
     return best
@@ -127,7 +129,7 @@ def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
     near = [pose for pose in poses if pose.merit > poses[0].merit - reach]
     tied, deformed = finish(pair, near, rough=poses[0].score < CLEAN)
     best = tied[0]
-    # What was found of those near says more than the scores that they had before.
+    # Near placements come as `finish` returns them: these scores are more reliable.
     others = pair.others(best, [*tied[1:], *(pose for pose in poses if pose not in near)])
     rivals = [pose.behind for pose in others if pose.merit > best.merit - reach]
     starts = zip(distinct_starts(), fits, strict=True)
@@ -140,7 +142,7 @@ def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
         search=Search.SO3 if wide else Search.EULER64,
         quality=compare(pair.pixie.boundary, pair.slat.boundary, transform, pair.parameters.radius),
         candidates=candidates_of(fitted),
-        # The next one's score may come from fewer samples, and then be the higher one.
+        # The next placement's score may come from fewer samples, and may then be higher.
         margin=max(best.merit - others[0].merit, 0.0) if others else 1.0,
         placements=tuple(
             Placement(pose.similarity.transform, pose.score, float(pair.apart([pose], best)[0]))
@@ -182,7 +184,7 @@ def fitted_near(
 ) -> tuple[Placement, float]:
     """Fit a placement from a rotation (3, 3), without the alignment's ground.
 
-    Returns it, and how much higher than the alignment it ranks once both are deformed.
+    Return the placement, and by how much it ranks above the alignment once both are deformed.
     """
     pair = _pair_of(field, latents, parameters, alignment.ground)
     starts = [
@@ -192,7 +194,7 @@ def fitted_near(
     (best, *_), deformed = finish(pair, poses[:1], rough=poses[0].score < CLEAN)
     own, figures = Similarity.of(alignment.transform), alignment.figures
     figures = figures or measure_figures(field, latents, alignment)
-    # Figures and model alone are compared; the warp is not known any more.
+    # The comparison uses only figures and model; the warp is no longer known.
     fit = Deformed(own, alignment.model, alignment.deformation, figures, Warp.unbent(own))
     before, after = (rank_of(free.pose, free.figures) for free in as_free(pair, [fit, deformed]))
     return Placement(best.similarity.transform, best.score, 0.0), after - before

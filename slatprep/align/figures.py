@@ -1,4 +1,4 @@
-"""What a fit's residuals say of it: the figures that a verdict rests on."""
+"""Measure the figures of a fit, on which the verdict rests, from its residuals."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from slatprep.geometry.voxels import above, occupancy_of
 from slatprep.records import Alignment, Deformation, FitFigures, MaterialField, StructuredLatents
 
 FIT_SAMPLES = 1_200
-"""Samples a side of the fit that is kept."""
+"""Samples per side of the final fit."""
 
 CHECK_SAMPLES = 500
-"""Samples a side, none of them used in the fit, from which its figures are taken."""
+"""Samples per side from which the figures are measured; none of them is used in the fit."""
 
 _MOST_OFFSET = 2.0
 
@@ -29,9 +29,10 @@ _MOST_OFFSET = 2.0
 def measure_figures(
     field: MaterialField, latents: StructuredLatents, alignment: Alignment
 ) -> FitFigures:
-    """Measure, at a placement of any engine, what the default engine measures of its fit.
+    """Measure the default engine's figures at a placement of any engine.
 
-    The alignment has no deformation. The offset is the one that suits the residuals best.
+    A deformation of the alignment is ignored. The offset is the median of the residuals, limited to
+    2 voxels.
     """
     slat = surface_of(occupancy_of(latents.coords, latents.resolution))
     pixie = surface_of(above(field.occupancy, alignment.ground))
@@ -52,10 +53,10 @@ def fit_figures(
     evidence: tuple[float, float] = (math.nan, math.nan),
     kept: Deformation | None = None,
 ) -> FitFigures:
-    """Measure a fit by residuals that it was not made from.
+    """Measure a fit on samples that it did not use.
 
-    `before` is the score of the similarity (that of `warp` if not given), `evidence` what an
-    affine map and bending added to it in a trial, and `kept` the deformation that `warp` is.
+    `before` is the score of the similarity (by default that of `warp`). `evidence` are the rises of
+    the score by an affine map and by bending in a trial. `kept` is the deformation in `warp`.
     """
     here, back = residuals.at(warp)
     both = np.abs(np.concatenate([here, back]))

@@ -1,4 +1,4 @@
-"""What is left of a search: refined, deformed where that is earned, and compared once more.
+"""Refine the placements that a search leaves, deform them if earned, and compare them again.
 
 Steps 4 and 6 of docs/design/alignment.md.
 """
@@ -29,22 +29,24 @@ from slatprep.geometry.frames import Array
 from slatprep.records import FitFigures, Model
 
 MOST_CONTESTED = 4
-"""Where the best placement is deformed or the sides are rough, so many, of those within twice
-`TIE`, are deformed too."""
+"""Largest number of placements that are deformed and compared, if the best one is deformed or the
+sides are rough. The others score within twice `TIE` of the best."""
 
 CONTEST_SAMPLES, SHARP = 2_000, 0.5
-"""Samples a side on which placements are held against each other, and the kernel's width [voxel]:
-narrower than in a fit, as what tells a front from a back may be fine."""
+"""Samples per side on which placements are compared, and the kernel's width [voxel]. It is narrower
+than in a fit, as a front may differ from a back in fine details only."""
 
 RIGID_IF_SCALE_WITHIN = 0.04
 RIGID_LOSS = 0.004
-"""A scale this near to one is kept only if it raises the score by more than this."""
+"""A scale whose distance from one is below the first number must raise the score by more than the
+second, or it is set to one."""
 
 
 def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], Deformed]:
-    """Refine poses on all samples, best first, and deform the best one if that is earned.
+    """Refine poses on `FINE_SAMPLES`, and deform the best one if that is earned.
 
-    Then those that fit about as well are deformed too: the order is by what that leaves.
+    If it is deformed or the sides are rough, deform the next ones too, and order all by their
+    scores after that. Return the poses, best first, and the fit of the best one.
     """
     fine = pair.refine(poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
     first, *others = pair.distinct(fine)
@@ -77,9 +79,9 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
 
 
 def as_free(pair: Pair, fits: Sequence[Deformed]) -> list[Deformed]:
-    """Return fits with the freedom that the freest of them has earned.
+    """Return the fits, each refitted with the freest model among them.
 
-    What may bend fits better anywhere, so two placements are held against each other alike.
+    A freer model fits better at any placement, so placements are compared with equal models.
     """
     models = {fit.model for fit in fits}
     if not models & {Model.AFFINE, Model.DEFORMABLE}:
@@ -98,10 +100,10 @@ def as_free(pair: Pair, fits: Sequence[Deformed]) -> list[Deformed]:
 def _told_apart(
     pair: Pair, best: Deformed, poses: Sequence[Pose], fits: Sequence[Deformed]
 ) -> list[Pose]:
-    """Return poses with by how many standard errors the best fits better than their fits.
+    """Return poses with `behind` set: by how many standard errors the best one fits better.
 
-    All are looked at on the same samples, so what the two sides differ in anyway cancels out.
-    Samples of one block of space err together: blocks are counted, not samples.
+    All fits are measured on the same samples, so the differences of the two sides cancel out.
+    Errors within a block of space are correlated, so blocks are counted, not samples.
     """
     if not poses:
         return []
@@ -116,7 +118,7 @@ def _told_apart(
 
 
 def _kernels(pair: Pair, fit: Deformed) -> tuple[Array, Array]:
-    """Return how well each sample fits, and where it lies in the SLAT frame."""
+    """Return each sample's kernel, with equal sums of weights by side, and its SLAT position."""
     residuals = Residuals(pair.slat, pair.pixie, fit.pose, CONTEST_SAMPLES)
     sides = residuals.at(fit.warp)
     kernels = [0.5 / len(side) / (1.0 + (side / SHARP) ** 2) for side in sides]
@@ -124,7 +126,7 @@ def _kernels(pair: Pair, fit: Deformed) -> tuple[Array, Array]:
 
 
 def rank_of(similarity: Similarity, figures: FitFigures) -> float:
-    """Return what placements are compared by once deformed: the score of unseen samples."""
+    """Return a deformed placement's rank: the score of unseen samples less the scale penalty."""
     score = 0.5 * (figures.score_slat + figures.score_pixieverse)
     return score - scale_penalty(similarity)
 
@@ -136,7 +138,7 @@ def _deformed(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:
 
 
 def _simplest(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Model]:
-    """Return the pose with its scale set to one where that fits as well, and the model."""
+    """Return the pose, with scale one if that fits about as well, and its model."""
     model = pair.parameters.model
     if model in ("rigid", "similarity"):
         return pose, Model(model)

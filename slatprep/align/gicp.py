@@ -1,9 +1,9 @@
-"""Generalised ICP of the package small_gicp, from the paper's start orientations.
+"""Align by generalised ICP (package small_gicp) from the paper's start orientations.
 
-Plane-to-plane distances do not lock to the lattice as point-to-point ones do.
-The starts run on thinned clouds, the best one again on all voxels. This engine
-stands between the paper's protocol and the default engine in the
-benchmark (A. Segal, D. Haehnel, S. Thrun, "Generalized-ICP", RSS 2009;
+Unlike point-to-point distances, plane-to-plane distances do not lock to the
+lattice. The starts run on thinned clouds, and the best one again on all voxels.
+In the benchmark this engine stands between the paper's protocol and the default
+engine (A. Segal, D. Haehnel, S. Thrun, "Generalized-ICP", RSS 2009;
 K. Koide, "small_gicp", JOSS 2024).
 """
 
@@ -21,7 +21,7 @@ from slatprep.parameters import AlignParameters
 from slatprep.records import RESOLUTION, Alignment, MaterialField, StructuredLatents
 
 THINNED = 2.0
-"""Voxels; the starts run on clouds thinned to one point in a cube of this edge."""
+"""Edge, in voxels, of the cubes in which the clouds of the starts have one point each."""
 
 
 def align(

@@ -1,8 +1,7 @@
-"""Ground under an object: a flat layer at one end of an annotation that a SLAT never has.
+"""Find ground under an object: a flat layer at one end of an annotation that no SLAT has.
 
-A NeRF's field may hold the object on a piece of the floor, as wide as the grid. Then the
-sizes and the centroids of the two sides say nothing of each other, and the surface of the
-floor outweighs that of the object.
+A NeRF's field may hold the object on a piece of the floor, as wide as the grid. Then sizes and
+centroids of the two sides do not match, and the floor has more surface than the object.
 """
 
 from __future__ import annotations
@@ -18,44 +17,45 @@ from slatprep.records import Alignment, Ground
 Array = NDArray[np.float64]
 
 DIRECTIONS, SAMPLES, VOXELS = 250, 500, 10_000
-"""Directions in which a layer is looked for, samples of the surface that are looked at there, and
-voxels of the solid from which its top is taken."""
+"""Number of directions in which a layer is searched, of surface samples used for that, and of
+voxels of the solid that determine the layer's top."""
 
 ENDS, END = 3, 6.0
-"""So many ends of the annotation are looked at: those with most samples within so many voxels."""
+"""Number of the annotation's ends that are searched, and their depth in voxels. The ends with most
+samples are taken."""
 
 SAME = 0.999
-"""Layers whose normals have such a cosine, and whose tops lie within half a voxel, are one."""
+"""Smallest cosine of the normals of layers that count as one, with tops within half a voxel."""
 
 BLOBS = 0.02
 """Share of the samples that may lie below the ground."""
 
 NARROWINGS = 6
-"""How often the plane of a layer is fitted to the samples near the one before."""
+"""Number of times that a layer's plane is fitted to the samples near the last plane."""
 
 HALF_LAYER = 3.5
-"""Samples so near the middle of a layer, in voxels, belong to it."""
+"""Largest distance, in voxels, of a layer's samples from its middle."""
 
 LEAST_FACE = 0.04
-"""A layer is looked at whose face is this share of the annotation's surface, both sides counted."""
+"""Smallest face of a layer, both sides counted, as a share of the annotation's surface."""
 
 LEAST_ABOVE = 0.05
-"""This share of the voxels lies above ground at least: less is a board's lid, and not an object."""
+"""Smallest share of the voxels above ground; less is the lid of a board, not an object."""
 
 RAISED = (0.0, 1.0, 2.0)
-"""Voxels above a layer's top at which it is cut off: an object stands in its ground, and that is
-rough."""
+"""Heights of the cut above a layer's top, in voxels: ground is rough, and objects stand in it."""
 
 LEAST_GAIN = 0.05
-"""A layer is ground if without it the score rises by so much."""
+"""Rise of the score without a layer above which the layer is ground."""
 
 
 def find_layers(surface: Surface) -> list[Ground]:
-    """Find flat layers at the ends of the PixieVerse side, widest first; any may be the object's.
+    """Find flat layers at the ends of the PixieVerse side, widest first.
 
-    The ends with most samples of the surface are looked at. There a plane is fitted to the samples
-    near it, again and again. The layer's top is where most voxels go away from one height to the
-    next, and the face is as large as these are many. Faces are at least `LEAST_FACE` large.
+    A layer may also belong to the object. Only the ends with most surface samples are searched. At
+    each end a plane is fitted repeatedly to the samples near it. The layer's top is the height at
+    which the number of voxels drops most. The drop measures the face, which must be at least
+    `LEAST_FACE`.
     """
     points = surface.subset(SAMPLES).points
     solid = np.flatnonzero(surface.distance < DILATION)
@@ -73,15 +73,15 @@ def find_layers(surface: Surface) -> list[Ground]:
 
 
 def raised(layer: Ground, voxels: float) -> Ground:
-    """Return a layer with its top so many voxels higher."""
+    """Return a layer with its top higher by `voxels`."""
     return _rounded(layer.normal, layer.height + voxels * VOXEL_SIZE)
 
 
 def gain(without: Alignment, found: Alignment) -> float:
-    """Return by how much the score of unused samples rises without a layer.
+    """Return the rise of the score on unused samples without a layer.
 
-    What may bend fits nearly anything to a slab. So two fits are compared before any deformation;
-    and as they are, if that says more, where both may bend alike.
+    With a deformation nearly anything fits a slab, so the scores before deformation are compared.
+    If both models are the same, the rise after deformation counts instead if it is larger.
     """
     here, there = without.figures, found.figures
     if here is None or there is None:
@@ -99,7 +99,7 @@ def _rounded(normal: Array, height: float) -> Ground:
 
 
 def _ends(points: Array) -> list[Array]:
-    """Return the directions from the ends with most points to the middle, no two alike."""
+    """Return the inward directions at the ends with most points, no two of them similar."""
     directions = even_directions(DIRECTIONS)
     heights = directions @ points.T
     rank = int(BLOBS * len(points))
@@ -115,7 +115,7 @@ def _ends(points: Array) -> list[Array]:
 
 
 def _layer(points: Array, inside: Array, normal: Array) -> tuple[Array, float, float]:
-    """Return the normal of the layer at an end, its top, and how many voxels go away there."""
+    """Return a layer's normal, its top, and by how many voxels the count drops there."""
     heights = points @ normal
     middle = float(np.quantile(heights, BLOBS)) + 0.5 * (END - 2.0)
     reach = 0.5 * (END + 2.0)
@@ -127,7 +127,7 @@ def _layer(points: Array, inside: Array, normal: Array) -> tuple[Array, float, f
         normal = axis if axis @ normal > 0 else -axis
         heights = points @ normal
         middle, reach = float(np.median(layer @ normal)), HALF_LAYER
-    # Voxels of a height, every half a voxel, and how much fewer there are one above than below.
+    # Voxels in slices of height, in steps of half a voxel, and their drop from below to above.
     edges = middle + np.arange(-8.0, 9.0, 0.5)
     inside_heights = inside @ normal
     halves = np.histogram(inside_heights, edges)[0].astype(np.float64)

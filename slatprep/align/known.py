@@ -1,8 +1,7 @@
-"""A frame that is known: nothing is searched, and what is said of it is measured as ever.
+"""Take a known frame without a search.
 
-The transform is the source's, the identity where it states none. Quality and,
-from them, confidence and verdict follow as for any engine, so a frame that is
-wrong shows.
+The transform is the source's, or the identity if the source states none. Quality, confidence and
+verdict are measured as for any engine, so a wrong frame shows.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Whether an annotation is a mirror image of its object, left hand for right.
+"""Test whether an annotation is a mirror image of its object.
 
-No rotation undoes a mirror. A mirrored annotation is laid on its object as well as its shape
-allows, and where the object is nearly its own mirror image that is very well. So the SLAT is
-mirrored, and laid on the annotation once more: where that fits clearly better, one side is
-the mirror image of the other.
+No rotation undoes a mirroring. A mirrored annotation still fits its object as well as the shape
+allows, and very well if the object is nearly its own mirror image. So the mirrored SLAT is fitted
+to the annotation too. If that fits clearly better, one side is the mirror image of the other.
 """
 
 from __future__ import annotations
@@ -23,14 +22,15 @@ WIDE_SAMPLES, WIDE_TAUS, WIDE_STARTS, WIDE_KEPT = 60, (8.0, 5.0, 3.0, 2.0), 240,
 NEXT_SAMPLES, NEXT_TAUS, NEXT_KEPT = 200, (2.0, 1.0, 1.0, 1.0), 2
 LAST_TAUS = (1.0, 1.0, 1.0)
 TRIAL_SAMPLES = 300
-"""Samples a side and widths of the kernel, step by step, and how many placements go on."""
+"""For each step: samples per side, widths of the kernel in voxels, starts, and placements kept."""
 
 
 def mirror_gain(pair: Pair, found: Similarity, poor: bool) -> float:
-    """Return by how much the score rises once one side is mirrored.
+    """Return the rise of the score once the SLAT is mirrored.
 
-    NaN where the placement found fits so well that it cannot rise by `MIRRORED`. Where the fit
-    is `poor`, all orientations are searched, and the scores are those after a trial deformation.
+    Return NaN if the score of `found` is so high that it cannot rise by `MIRRORED`. If the fit is
+    `poor`, all orientations are searched, and scores are those after a trial deformation, if the
+    parameters allow one.
     """
     (best,) = pair.refine([Pose(found)], POLISH_SAMPLES, (), 0.01)
     if best.score > 1.0 - MIRRORED:
@@ -43,7 +43,7 @@ def mirror_gain(pair: Pair, found: Similarity, poor: bool) -> float:
         (other,) = mirrored.refine(_best(tried, 1), POLISH_SAMPLES, LAST_TAUS, 0.01)
         return other.score - best.score
     kept = _best(tried, NEXT_KEPT)
-    # Every second one: a mirrored side that fits better has more than one way to it.
+    # Every second start is enough: several starts lead to a mirrored fit that is better.
     rotations = [s.rotation for s in distinct_starts()] + list(so3_starts(WIDE_STARTS)[::2])
     starts = mirrored.starts(rotations, pair.size_ratio)
     kept += _best(mirrored.refine(starts, WIDE_SAMPLES, WIDE_TAUS, 0.02), WIDE_KEPT)
@@ -61,10 +61,10 @@ def _best(poses: Sequence[Pose], most: int) -> list[Pose]:
 
 
 def _reflected(pair: Pair, found: Similarity) -> list[Pose]:
-    """Return placements on the mirrored SLAT that reflect the one found, in six planes.
+    """Return placements on the mirrored SLAT: the found one, reflected in six planes.
 
-    The planes are the SLAT's principal ones and those of the grid. What is nearly symmetric
-    is so in a principal plane, but where two variances are alike these are turned at will.
+    The planes are the SLAT's principal planes and those of the grid. A plane of symmetry is a
+    principal plane, but principal planes are arbitrary if two variances are equal.
     """
     flip, centre = np.diag([-1.0, 1.0, 1.0]), pair.slat.centroid
     poses = []

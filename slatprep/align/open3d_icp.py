@@ -1,10 +1,9 @@
 """The paper's protocol: point-to-point ICP on Open3D from 64 start orientations.
 
-SLAT-Phys, "Physics-to-SLAT Annotation Alignment": the boundary voxels of the
-PixieVerse occupancy are the source, the SLAT voxels the target; the start
-whose ICP reaches the highest fitness wins, a final ICP gives T in SE(3). The
-correspondence radius that lets ICP converge saturates the fitness of many
-starts, so the candidates are compared at a tight one, rmse breaking ties.
+SLAT-Phys, "Physics-to-SLAT Annotation Alignment": the boundary voxels of the PixieVerse occupancy
+are the source, the SLAT voxels the target. The start whose ICP reaches the highest fitness wins,
+and a final ICP gives T in SE(3). At the radius with which ICP converges, many starts reach a
+fitness of 1. So candidates are compared at a tight radius, and the rmse breaks ties.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ def align(
 ) -> Alignment:
     """Align by the paper's protocol; see `slatprep.align.align`.
 
-    `starts` is for the benchmark, which times all 64 as published; left out,
-    the 40 that repeat another rotation are not computed twice.
+    `starts` is for the benchmark, which times all 64 as published. By default the
+    40 that repeat another rotation are not computed twice.
     """
     o3d = load_open3d()
     registration = o3d.pipelines.registration
@@ -54,17 +53,17 @@ def align(
         score = registration.evaluate_registration(source, target, tight, transform)
         return score.fitness, score.inlier_rmse / VOXEL_SIZE, transform
 
-    # Open3D sums over threads in the order in which they finish: with one, the
-    # same input gives the same bits.
+    # Open3D sums over threads in the order in which they finish. With one thread
+    # the same input gives the same bits.
     with single_threaded():
         return search_starts(field, latents, parameters, scored, icp, starts)
 
 
 def load_open3d() -> Any:
-    """Import Open3D, from wheels alone; a SlatprepError says why it cannot be loaded.
+    """Import Open3D from wheels alone; raise SlatprepError if it cannot be loaded.
 
-    Since 0.20 Open3D needs the system's libusb, though nothing here uses it; a copy that a wheel
-    carries, loaded first, satisfies the dynamic linker.
+    Since 0.20 Open3D needs the system's libusb, though nothing here uses it. The copy in the wheel
+    libusb_package, loaded first, satisfies the dynamic linker.
     """
     if sys.platform == "linux" and sys.version_info >= (3, 13):
         import ctypes

@@ -1,8 +1,7 @@
-"""Two surfaces and what every step of the search does with them.
+"""Two surfaces, and the operations on poses that all steps of the search use.
 
-Poses are refined, polished, told apart and put in order. `slatprep.align.field` says in which
-order, and when it is enough; `slatprep.align.search` looks through all orientations, and
-`slatprep.align.finish` refines, deforms and compares what is left.
+`slatprep.align.field` decides which steps run in which order. `slatprep.align.search` searches all
+orientations, and `slatprep.align.finish` refines, deforms and compares the remaining poses.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from slatprep.geometry.kernel import kernel
 from slatprep.parameters import AlignParameters
 
 COARSE_SAMPLES, POLISH_SAMPLES, FINE_SAMPLES = 100, 400, 2_000
-"""Samples a side used from the starts, on the survivors, and at the end."""
+"""Samples per side for the starts, for the survivors, and for the last refinement."""
 
 COARSE_TAUS = (8.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0, 2.0)
 POLISH_TAUS = (2.0,) * 4 + (1.0,) * 4
@@ -28,32 +27,32 @@ FINE_TAUS = (1.0,) * 10
 """Width of the robust kernel at each step, in voxels."""
 
 SURVIVORS, MOST_SURVIVORS = 4, 24
-"""Distinct placements that are polished: at least, whatever they score, and at most."""
+"""Smallest number, whatever they score, and largest number of placements that are polished."""
 
 TIE = 0.03
-"""Placements that score less than this below the best one fit about as well."""
+"""Difference to the best score below which a placement fits about as well."""
 
 DISTINCT = 1.5
-"""Voxels, rms over the SLAT's surface, from which on two placements are two."""
+"""Smallest distance of two distinct placements: rms over the SLAT's surface, in voxels."""
 
 SCALE_PRIOR = 0.04
-"""By so much a scale off by 28 % (a quarter, as a logarithm) lowers the rank, squared beyond."""
+"""Loss of rank by a scale off by 28 % (logarithm 0.25); it grows as the logarithm squared."""
 
 RANK_STANDING = 0.01
-"""By so much another placement must rank above the one that fits best as a similarity."""
+"""Lead in rank that a placement needs over the one that fits best as a similarity."""
 
 RANK_SAMPLES = 250
-"""Samples at which deformed placements are told apart."""
+"""Samples at which deformed placements are compared."""
 
 
 def scale_penalty(similarity: Similarity) -> float:
-    """By how much the scale of a placement lowers its rank once it is deformed."""
+    """Return by how much the scale of a deformed placement lowers its rank."""
     return float(SCALE_PRIOR * (np.log(similarity.scale) / 0.25) ** 2)
 
 
 @kernel()
 def first_of_each(places, distance, most):  # type: ignore[no-untyped-def]
-    """Choose at most so many of places (n, 12), best first, none near to a better one."""
+    """Choose at most `most` of places (n, 12), given best first, none near a better one."""
     kept = np.empty(min(most, len(places)), np.intp)
     found = 0
     for k in range(len(places)):
@@ -67,7 +66,7 @@ def first_of_each(places, distance, most):  # type: ignore[no-untyped-def]
 
 
 def far_apart(places: Sequence[Array]) -> list[int]:
-    """Choose placements, best first, none near to a better one, by deformed places (N, 3)."""
+    """Choose placements, given best first by deformed places (N, 3), none near a better one."""
     kept: list[int] = []
     for k, own in enumerate(places):
         apart = (np.sqrt(((own - places[other]) ** 2).sum(axis=1).mean()) for other in kept)
@@ -77,7 +76,7 @@ def far_apart(places: Sequence[Array]) -> list[int]:
 
 
 class Pair:
-    """Two surfaces and what the search asks of them."""
+    """The SLAT's and the PixieVerse surface, with the operations of the search."""
 
     def __init__(self, slat: Surface, pixie: Surface, parameters: AlignParameters) -> None:
         self.slat, self.pixie = slat, pixie
@@ -87,7 +86,7 @@ class Pair:
 
     @cached_property
     def principal(self) -> tuple[Array, Array]:
-        """Principal axes of the SLAT's samples, columns (3, 3): unit vectors; as long as spread."""
+        """Principal axes of the SLAT's samples, columns (3, 3): unit vectors; times the spread."""
         points = self.slat.points
         covariance = np.cov(points.T, bias=True) if len(points) > 1 else np.zeros((3, 3))
         variances, axes = np.linalg.eigh(covariance)
@@ -99,18 +98,18 @@ class Pair:
 
     @property
     def size_ratio(self) -> float:
-        """The scale that lays size on size, within its bounds; 1 where scale is not free."""
+        """SLAT size over PixieVerse size, within the scale's bounds; 1 if the scale is fixed."""
         if not self.free_scale or self.pixie.size <= 0:
             return 1.0
         low, high = self.parameters.scale_bounds
         return float(np.clip(self.slat.size / self.pixie.size, low, high))
 
     def subsets(self, samples: int) -> tuple[Surface, Surface]:
-        """Return the SLAT's and the PixieVerse surface with at most so many samples."""
+        """Return the SLAT's and the PixieVerse surface with at most `samples` samples."""
         return self.slat.subset(samples), self.pixie.subset(samples)
 
     def starts(self, rotations: Iterable[Array], scale: float) -> list[Pose]:
-        """Return poses that lay centroid on centroid."""
+        """Return a pose for each of the rotations, with the centroids on each other."""
         turns = np.array([*rotations])
         shifts = self.slat.centroid - scale * (turns @ self.pixie.centroid)
         return [Pose(Similarity(*pose, scale)) for pose in zip(turns, shifts, strict=True)]
@@ -141,20 +140,23 @@ class Pair:
         ]
 
     def polish(self, poses: Sequence[Pose]) -> list[Pose]:
-        """Refine the best distinct poses further; best first."""
+        """Refine the best distinct poses further and return them best first."""
         survivors = self.distinct(poses)
         likely = [p for p in survivors if p.score > survivors[0].score - 2 * TIE]
         survivors = survivors[: min(max(SURVIVORS, len(likely)), MOST_SURVIVORS)]
         return self.distinct(self.refine(survivors, POLISH_SAMPLES, POLISH_TAUS, 0.01))
 
     def apart(self, poses: Sequence[Pose], other: Pose) -> Array:
-        """Rms distance, in voxels, between where poses and another look the SLAT's surface up."""
+        """Return the rms distance [voxel] of each pose from `other`, over the SLAT's surface.
+
+        It is measured in the PixieVerse frame.
+        """
         places = self.places([*poses, other])
         distance: Array = np.linalg.norm(places[:-1] - places[-1], axis=1)
         return distance
 
     def others(self, best: Pose, poses: Sequence[Pose]) -> list[Pose]:
-        """Return the distinct ones of poses that do not repeat `best`, whatever their scores."""
+        """Return the distinct poses that do not repeat `best`, whatever their scores."""
         apart = self.apart(poses, best) >= DISTINCT
         far = [pose for pose, ok in zip(poses, apart, strict=True) if ok]
         return self.distinct(far) if far else []
@@ -163,7 +165,8 @@ class Pair:
         """Return poses as points in 12 dimensions whose distances are those of `apart`.
 
         Over samples of mean m and covariance L L^T, the mean square of A x + b is
-        the sum of squares of A L and of A m + b. The `affines` (n, 3, 4) come before the poses.
+        the sum of squares of A L and of A m + b. The `affines` (n, 3, 4) are applied before the
+        poses.
         """
         all_poses = Poses.of([pose.similarity for pose in poses])
         inverse = all_poses.rotations.transpose(0, 2, 1) / all_poses.scales[:, None, None]
@@ -180,7 +183,7 @@ class Pair:
         return [rest[k] for k in first_of_each(self.places(rest), DISTINCT, len(rest))]
 
     def at_scale_one(self, similarity: Similarity) -> Similarity:
-        """Return a similarity of scale one that looks the middle of the SLAT up where this does."""
+        """Return the similarity of scale one that maps the SLAT's centroid to the same point."""
         centre = self.slat.centroid
         shift = centre + (similarity.shift - centre) / similarity.scale
         return similarity._replace(shift=shift, scale=1.0)

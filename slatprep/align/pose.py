@@ -1,4 +1,4 @@
-"""A placement while it is searched for: a similarity, and how well it fits."""
+"""A placement during the search: a similarity, and how well it fits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Similarity(NamedTuple):
 
     @classmethod
     def of(cls, transform: Array) -> Similarity:
-        """Return that of a 4x4 matrix between the unit cubes."""
+        """Return the similarity of a 4x4 matrix between the unit cubes."""
         rotation, shift, scale = split_transform(transform)
         return cls(rotation, shift / VOXEL_SIZE, scale)
 
@@ -41,7 +41,7 @@ class Similarity(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Many similarities as kernels take them, and change them."""
+    """Many similarities as arrays, which kernels read and change in place."""
 
     rotations: Array  # (n, 3, 3)
     shifts: Array  # (n, 3)
@@ -50,11 +50,11 @@ class Poses(NamedTuple):
 
     @classmethod
     def of(cls, similarities: Sequence[Similarity]) -> Poses:
-        """Return copies of all."""
+        """Return the similarities, copied into arrays."""
         return cls(*(np.array(each) for each in zip(*similarities, strict=True)))
 
     def similarities(self) -> list[Similarity]:
-        """Return them one by one."""
+        """Return the similarities as a list."""
         numbers = self.scales.tolist(), self.offsets.tolist()
         each = zip(self.rotations, self.shifts, *numbers, strict=True)
         return [Similarity(*one) for one in each]
@@ -64,11 +64,11 @@ class Poses(NamedTuple):
 class Pose:
     """A similarity and how well it fits.
 
-    ``score`` is the mean robust kernel over the samples of both sides, 1 for a
-    perfect fit; ``fitness`` the share of samples within one voxel.
-    ``bonus`` is what a trial deformation added to the score, where one was made;
-    ``standing`` counts in the order of placements, and not in how far they are apart.
-    ``behind`` is by how many standard errors it fits worse than the best one; NaN: not measured.
+    ``score`` is the mean robust kernel over the samples of both sides, 1 for a perfect fit.
+    ``fitness`` is the share of samples within one voxel. ``bonus`` is the rise of the score by a
+    deformation, if one was tried. ``standing`` counts in the order of placements, but not in their
+    margin. ``behind`` is by how many standard errors the pose fits worse than the best one; NaN if
+    not measured.
     """
 
     similarity: Similarity
@@ -81,10 +81,10 @@ class Pose:
 
     @property
     def merit(self) -> float:
-        """How well it fits, once deformed where that was tried."""
+        """The score, after deformation if one was tried."""
         return self.score + self.bonus
 
     @property
     def rank(self) -> float:
-        """What placements are ordered by."""
+        """The value that orders placements."""
         return self.merit + self.standing

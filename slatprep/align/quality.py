@@ -1,4 +1,4 @@
-"""How good an alignment is: figures at a tight radius."""
+"""Measure the quality of an alignment at a tight radius."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def measure_quality(
 ) -> Quality:
     """Measure how well the outer surfaces of the two sides lie on each other; see `compare`.
 
-    The transform (4, 4) leads to the SLAT frame; ground does not count.
+    The transform (4, 4) maps to the SLAT frame. Voxels of the ground are left out.
     """
     return compare(
         outer_boundary(above(field.occupancy, ground)),
@@ -39,15 +39,15 @@ def compare(
 ) -> Quality:
     """Compare boundary voxels (K, 3) and (N, 3), each in its own frame, under a transform (4, 4).
 
-    Both are boundaries of filled sets: a SLAT has voxels inside the object wherever its parts meet,
-    which a solid's boundary cannot have. Partners farther apart than `radius` (voxels of the SLAT
-    frame) are no inliers.
+    Both must be boundaries of filled sets. A SLAT also has voxels inside the object where its parts
+    meet, and the boundary of a solid has none there. A partner farther away than `radius` (voxels
+    of the SLAT frame) is no inlier.
     """
     from slatprep.geometry.nearest import Lattice
 
-    # Both ways the points are carried to the other side's lattice, where the
-    # nearest voxel is found without a tree; the scale turns distances in the
-    # PixieVerse frame into voxels of the SLAT frame.
+    # Both ways the points are carried to the other side's lattice, where the nearest voxel is found
+    # without a tree. The scale converts distances in the PixieVerse frame to voxels of the SLAT
+    # frame.
     _, _, scale = split_transform(transform)
     carried = apply_transform(transform, voxel_centres(pixieverse))
     forward, _ = Lattice(slat).nearest(carried, limit=radius)

@@ -1,4 +1,4 @@
-"""Samples of two surfaces, their residuals under a warp, and the steps that make these smaller."""
+"""Samples of two surfaces, their residuals under a warp, and the steps that reduce them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ BLOCK = 8.0
 """Edge, in voxels, of the blocks of space that are fitted and held out in turn."""
 
 COARSEST = 32.0
-"""Spacing of the first lattice in voxels; each further one has half of it."""
+"""Spacing of the first lattice in voxels; each further lattice has half the spacing."""
 
 STIFFNESS = 200.0
 """Weight of the mean squared second derivative (1 / voxel^2) against that of a squared residual."""
 
 SOLVER_STEPS = 6
-"""Steps of conjugate gradients for each step of Gauss and Newton."""
+"""Steps of conjugate gradients for each Gauss-Newton step."""
 
 _DAMPING = 1e-6
 
@@ -50,7 +50,7 @@ class Residuals:
         self._pixie_rows = len(here.points)
 
     def held_out(self) -> NDArray[np.bool_]:
-        """Return which samples lie in the blocks that a trial does not see."""
+        """Return whether each sample lies in a block that a trial does not see."""
         low = self.surface.points.min(axis=0) - 1.0
         blocks = np.floor((self._lines.places - low) / BLOCK).astype(np.intp)
         odd: NDArray[np.bool_] = blocks.sum(axis=1) % 2 == 1

@@ -1,4 +1,4 @@
-"""The search of all orientations, and of shapes that differ.
+"""Search all orientations, and rank placements of shapes that differ.
 
 Steps 3 and 5 of docs/design/alignment.md.
 """
@@ -30,31 +30,31 @@ from slatprep.align.stretch import stretch
 from slatprep.align.warp import Warp, from_nearest, places_of
 
 SO3_STARTS, SO3_HALFWAY, SO3_KEPT = 240, 4, 80
-"""Starts over all orientations, and how many of them are refined further after so many steps.
+"""Number of starts over all orientations, of steps before a selection, and of starts kept then.
 
-Of 180 assets the best placement was among the first 30 then, but for three with ties in plenty.
+The best placement was among the first 30 then for 177 of 180 assets; the others have many ties.
 """
 
 SAME_SIZE = 0.05
-"""Sizes whose ratio is this near to one need no second set of starts, at scale one."""
+"""Largest difference of the size ratio from one without a second set of starts at scale one."""
 
 RANK_WITHIN, MOST_RANKED = 0.12, 6
-"""Where the best fit is poor, so many placements within so much of it are ranked anew, by what
-they score after a trial deformation."""
+"""If the best fit is poor, at most `MOST_RANKED` placements whose score is within `RANK_WITHIN` of
+it are ranked by their score after a trial deformation."""
 
 STRETCH_MANY = 40, (5.0, 4.0, 3.0), 24
 STRETCH_FEW = 160, (3.0, 2.0, 2.0, 1.5), MOST_RANKED
-"""Where the best fit is poor, all poses halfway through the search of all orientations are
-stretched, and the best of them once more: samples a side, widths of the kernel, how many are left.
+"""Samples per side, widths of the kernel in voxels, and number of poses kept.
 
-Of 140 pairs of generated shapes the right placement of 12 did not fit best as a similarity:
-halfway it was the 6th to the 94th.
+If the best fit is poor, all poses halfway through the search of all orientations are stretched. The
+best of them are stretched once more. In 12 of 140 pairs of generated shapes the right placement did
+not fit best as a similarity: halfway it ranked 6th to 94th.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Stretched:
-    """A pose and the affine map before it, with its score."""
+    """A pose, the affine map that is applied before it, and their score."""
 
     pose: Pose
     warp: Warp
@@ -66,17 +66,17 @@ def _unstretched(poses: Iterable[Pose]) -> list[Stretched]:
 
 
 def search_all(pair: Pair) -> tuple[list[Pose], list[Pose]]:
-    """Refine starts in all orientations, those that look hopeless halfway not to the end.
+    """Refine starts in all orientations, and drop the worst ones halfway.
 
-    Returns those that were refined to the end, and those of the first set halfway.
+    Return the poses refined to the end, and all poses of the first set as they were halfway.
     """
     scales = [pair.size_ratio]
     if abs(scales[0] - 1.0) > SAME_SIZE:
-        # Floaters, ground and missing parts falsify sizes; one is the likeliest scale.
+        # Floaters, ground and missing parts falsify sizes, and the likeliest scale is one.
         scales.append(1.0)
     sets: list[list[Pose]] = []
     for scale in scales:
-        # The second set is a supplement, and half as dense for the sake of time.
+        # The second set is half as dense, to save time.
         starts = pair.starts(so3_starts(SO3_STARTS)[:: 2 if sets else 1], scale)
         taus = COARSE_TAUS[:SO3_HALFWAY]
         free = pair.free_scale and not sets
@@ -90,8 +90,8 @@ def search_all(pair: Pair) -> tuple[list[Pose], list[Pose]]:
 def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:
     """Order the best poses by how well they fit once deformed.
 
-    Where shapes differ, the score of a similarity says little about which
-    placement is right. What a trial deformation leaves says more.
+    If shapes differ, the score of a similarity says little about which placement is right. The
+    score after a trial deformation says more.
     """
     near = [p for p in poses if p.score > poses[0].score - RANK_WITHIN][:MOST_RANKED]
     likely = stretched(pair, near, halfway)
@@ -111,12 +111,12 @@ def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[P
 
 
 def stretched(pair: Pair, near: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:
-    """Return the placements that fit best if they may be stretched.
+    """Return the placements that fit best after an affine map.
 
-    Squashed by a quarter, an apple fits best as a similarity if it lies on its side,
-    and a search for similarities may not come to the right placement at all. So
-    `halfway`, poses of all orientations, are stretched, and the best of them once more, beside
-    `near`, which fit well as they are.
+    An apple squashed by a quarter fits best as a similarity if it lies on its side, so a search for
+    similarities may miss the right placement. Therefore `halfway`, poses of all orientations, are
+    stretched. The best of them are stretched once more, with `near`, the poses that already fit
+    well.
     """
     first = _stretch(pair, _unstretched(halfway), *STRETCH_MANY)
     found = _stretch(pair, [*_unstretched(near), *first], *STRETCH_FEW)
@@ -136,7 +136,7 @@ def stretched(pair: Pair, near: Sequence[Pose], halfway: Sequence[Pose]) -> list
 def _stretch(
     pair: Pair, poses: Sequence[Stretched], samples: int, taus: Sequence[float], most: int
 ) -> list[Stretched]:
-    """Stretch poses further; return so many distinct ones at most, best first."""
+    """Stretch poses further; return at most `most` distinct ones, best first."""
     slat, pixie = pair.subsets(samples)
     affines = np.array([s.warp.affine for s in poses])
     stretched = Poses.of([s.pose.similarity._replace(offset=s.warp.offset) for s in poses])

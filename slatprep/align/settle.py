@@ -1,4 +1,4 @@
-"""Take another one of an asset's tied placements, and fit there what its engine fits."""
+"""Take another of an asset's tied placements, and refit it with the asset's engine."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from slatprep.records import (
 def take(
     alignment: Alignment, chosen: int, latents: StructuredLatents, by: Consensus | LatentChoice
 ) -> Alignment:
-    """Exchange an alignment's placement for number `chosen` of its `placements`.
+    """Replace an alignment's placement by entry `chosen` of its `placements`.
 
-    The placement that was left comes first among the placements. The result has no deformation, and
-    the old placement's quality: `refit` gives it its own.
+    The old placement becomes the first of the placements. The result has no deformation, and still
+    the old placement's quality, which `refit` replaces.
     """
     placement = alignment.placements[chosen]
-    # Scores are relative to the best fit; the one that was left had it.
+    # `_apart_from` sets the displacement.
     left = Placement(alignment.transform, alignment.score, 0.0)
     others = [p for k, p in enumerate(alignment.placements) if k != chosen]
     return replace(
         alignment,
         transform=placement.transform,
-        # A deformation was fitted to the placement that is left.
+        # The deformation was fitted to the old placement.
         model=Model.SIMILARITY if alignment.deformation is not None else alignment.model,
         deformation=None,
         figures=None,
@@ -50,9 +50,9 @@ def refit(
     latents: StructuredLatents,
     parameters: AlignParameters,
 ) -> Alignment:
-    """Fit at the placement that `take` chose what the engine fits at the one it chooses.
+    """Refit the placement that `take` chose, as the engine does with its own choice.
 
-    The quality is measured there. The default engine also refines the placement, sets its scale to
+    The quality is measured anew. The default engine also refines the placement, sets its scale to
     one if that fits as well, and deforms it if that is earned.
     """
     if alignment.engine is Engine.FIELD:

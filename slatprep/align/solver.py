@@ -8,12 +8,12 @@ distance carried to the SLAT frame, the residuals are
     r = F(x) - f_S(x) - o            at SLAT samples x,
     r = f_S(T y) - s f_P(y) + o      at PixieVerse samples y,
 
-each weighted by (1 + r^2 / tau^2)^-2, the Geman-McClure estimator, so that
-bites, floaters and parts that only one side has lose their pull.
+each weighted by (1 + r^2 / tau^2)^-2 (Geman-McClure estimator), so that bites,
+floaters and parts of one side only have little weight.
 
-The derivative by the scale leaves out that s also stretches the distances: with
-it, a smaller s would make the residuals of rough surfaces smaller, and scale
-would pay for noise (1.5 % too small on thick, rough fields).
+The derivative with respect to the scale ignores that s also stretches the distances. With that term
+a smaller s would reduce the residuals of rough surfaces, and noise would bias the scale (1.5 % too
+small on thick, rough fields).
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from slatprep.align.equations import (
 from slatprep.geometry.kernel import kernel
 
 _OFFSET_PRIOR = 0.02
-_LEVER = 30.0  # voxels; what a turn or a change of scale moves at the object's rim
+_LEVER = 30.0  # voxels; distance of the object's rim from its centre
 _LONGEST_TURN = 0.35
 _LARGEST_GROWTH = 0.1
 
 
 @kernel()
 def _links(rotation, shift, scale, offset, memory):  # type: ignore[no-untyped-def]
-    """Where the SLAT's samples are looked up at a pose, and where the PixieVerse ones are."""
+    """Return the `Link` of the SLAT samples at a pose, and that of the PixieVerse samples."""
     inverse, forth, minus, back = memory
     for i in range(3):
         back[i] = 0.0
@@ -56,7 +56,7 @@ def _links(rotation, shift, scale, offset, memory):  # type: ignore[no-untyped-d
 
 @kernel()
 def _rotation_of(turn):  # type: ignore[no-untyped-def]
-    """Rotation matrix of a rotation vector, by way of the unit quaternion."""
+    """Return the rotation matrix of a rotation vector, by way of the unit quaternion."""
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     w = math.cos(0.5 * angle)
     ratio = math.sin(0.5 * angle) / angle if angle > 1e-12 else 0.5
@@ -74,16 +74,14 @@ def _rotation_of(turn):  # type: ignore[no-untyped-def]
 def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tolerance):  # type: ignore[no-untyped-def]
     """Refine `Poses` of the PixieVerse surface on the SLAT surface, both `Samples`, in place.
 
-    Where `size_by_slat`, the equations of scale and offset are summed over the
-    SLAT samples alone. Floaters, ground and bumps of a rough field are surface
-    that only PixieVerse has, and all of it lies outside: its samples would make
-    the object smaller.
+    If `size_by_slat`, the equations of scale and offset are summed over the SLAT samples alone.
+    Floaters, ground and bumps of a rough field are surface that only PixieVerse has, outside the
+    object. Their samples would make the object smaller.
 
-    One Gauss-Newton step for each of `taus` (voxels), ended early once a step
-    moves the object's rim by less than `tolerance` voxels. Returns, a row a
-    pose, the mean kernel at tau = 1 voxel over the SLAT's and over the
-    PixieVerse samples, the share of all samples within one voxel, and the rms
-    residual of those.
+    Take one Gauss-Newton step for each of `taus` (voxels), and stop once a step moves the object's
+    rim by less than `tolerance` voxels. Return a row (4,) for each pose: the mean kernel at tau = 1
+    voxel over the SLAT's and over the PixieVerse samples, the share of samples within one voxel,
+    and their rms residual.
     """
     centre = centre_of(slat)
     scale_low, scale_high = scale_bounds
@@ -109,8 +107,8 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
             if size_by_slat:
                 for i in range(6, SIMILARITY):
                     normal[i, :6] = 2.0 * by_slat[:6, i]
-            # On a ball, offset and scale cannot be told apart: a weak prior keeps
-            # the offset near 0. A little damping keeps a plane's slide at rest.
+            # On a ball, offset and scale have the same effect, so a weak prior keeps the
+            # offset near 0. A little damping (below) keeps a plane from sliding.
             normal[7, 7] += _OFFSET_PRIOR * samples
             rhs[7] -= _OFFSET_PRIOR * samples * offset
             if not free_scale:

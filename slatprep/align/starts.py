@@ -20,7 +20,7 @@ Transform = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Start:
-    """One of the 64 Euler triples, its rotation, and the earlier one it repeats."""
+    """One of the 64 Euler triples, its rotation, and the earlier start that it repeats."""
 
     index: int
     euler_degrees: tuple[float, float, float]
@@ -32,8 +32,8 @@ class Start:
 def euler_starts() -> tuple[Start, ...]:
     """Return the 64 starts: turns by 0, 90, 180 and 270 degrees about x, then y, then z.
 
-    Only 24 of them are different rotations; the others name, in `same_as`, the first start that has
-    the same one. SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
+    Only 24 of them are different rotations. The `same_as` of the others is the index of the first
+    start with the same rotation. SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
     """
     cos, sin = (1, 0, -1, 0), (0, 1, 0, -1)
     starts: list[Start] = []

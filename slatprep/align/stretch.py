@@ -26,12 +26,12 @@ from slatprep.geometry.kernel import kernel
 RIDGE = 1e-4
 
 _LEAST, _MOST = 0.2, 5.0
-"""Between these the determinant stays: what is flatter or longer is not the shape any more."""
+"""Limits of the map's determinant, beyond which the shape is no longer recognisable."""
 
 
 @kernel()
 def _links(rotation, shift, scale, offset, affine, inverse):  # type: ignore[no-untyped-def]
-    """Where the SLAT's samples are looked up, and where the PixieVerse ones are."""
+    """Return the `Link` of the SLAT samples, and that of the PixieVerse samples."""
     there, here, turn = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     away, back = np.zeros(3), np.zeros(3)
     for i in range(3):
@@ -48,11 +48,11 @@ def _links(rotation, shift, scale, offset, affine, inverse):  # type: ignore[no-
 
 @kernel()
 def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
-    """Fit an affine map (3, 4) before each of `Poses`, a step for each of `taus` (voxels).
+    """Fit an affine map (3, 4), applied before each of `Poses`, by a step for each of `taus`.
 
-    Both sides are `Samples`. Writes the maps and the offsets of the poses; returns the mean
-    kernel at tau = 1 voxel of each, the sides with equal weight. A step that would squash the
-    shape flat is not taken, and the score is 0 then.
+    Both sides are `Samples`, and `taus` are in voxels. Write the maps to `affines` and the offsets
+    to `poses`. Return each pose's mean kernel at tau = 1 voxel, with equal weight for both sides.
+    If a step takes the determinant beyond its limits, undo it, stop, and set the score to 0.
     """
     here, back = len(slat.values), len(pixie.values)
     equations, normal, rhs = new_equations(), np.zeros((AFFINE, AFFINE)), np.zeros(AFFINE)

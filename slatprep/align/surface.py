@@ -1,9 +1,9 @@
 """A voxel set as the signed distance to its surface.
 
 The two sides show one object differently: PixieVerse as a filled solid, TRELLIS
-as the voxels that the surface passes through. Filling the SLAT makes them the
-same kind of thing, so that neither a missing inside nor half a voxel of
-thickness pulls the alignment to one side.
+as the voxels that the surface passes through. Filling the SLAT makes them
+comparable: neither a missing inside nor half a voxel of thickness biases the
+alignment.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ CENTRE = (RESOLUTION - 1) / 2
 """Index of the cube's centre; positions below are in voxels relative to it."""
 
 DILATION = 0.5
-"""How far, in voxels, the outer faces of a voxelised surface stand off the surface.
+"""Distance, in voxels, of the outer faces of a voxelised surface from the surface.
 
-A voxel belongs to the set if the surface passes through it anywhere, so the set
-is thicker than the object by half a voxel on average on a face along the grid,
-somewhat more on slanted ones. It matters where the two sides have different
-scales: half a voxel is then not the same length on both.
+A voxel belongs to the set if the surface passes through it anywhere. So the set is thicker than the
+object: by half a voxel on average on a face along the grid, and by somewhat more on slanted ones.
+This matters if the two sides have different scales, as half a voxel is then not the same length on
+both.
 """
 
 BAND = 1.0
-"""Lattice points this close (voxels) to the outer faces are the surface's samples."""
+"""Largest distance, in voxels, of the surface's samples (lattice points) from the outer faces."""
 
 _MARGIN = 4
 
 
 class Samples(NamedTuple):
-    """A surface as kernels take it: samples, and the field that other samples look up."""
+    """A surface in the form that kernels take: samples, and the field that the other side reads."""
 
     columns: NDArray[np.float64]  # (3, M), voxels from the cube's centre
     values: NDArray[np.float64]  # (M,), signed distance [voxel]
@@ -72,7 +72,7 @@ class Surface:
 
     @cached_property
     def samples(self) -> Samples:
-        """What kernels need of it."""
+        """The surface in the form that kernels take."""
         columns = np.ascontiguousarray(self.points.T)
         return Samples(columns, self.values, self.distance, self.origin)
 
@@ -101,14 +101,14 @@ class Surface:
     def subset(self, count: int, first: int = 0) -> Surface:
         """Return the same surface with at most `count` evenly chosen samples.
 
-        Those from the number `first` on are others than the first ones, unless
-        there are too few. They are chosen once, as many fits ask for the same.
+        Samples from number `first` on differ from the first ones, unless there are too few.
+        Subsets are cached, as many fits use the same.
         """
         if (count, first) not in self._subsets:
             chosen = np.arange(len(self.points))
             if len(chosen) > count:
                 chosen = even_choice(len(chosen), count, first)
-                # In order, so each is compared with the one before it: no sorting once more.
+                # The indices are sorted, so comparing neighbours finds repeats.
                 chosen = chosen[np.append(True, chosen[1:] > chosen[:-1])]
             some = replace(self, points=self.points[chosen], values=self.values[chosen])
             self._subsets[count, first] = some
@@ -116,26 +116,26 @@ class Surface:
 
 
 def even_choice(total: int, count: int, first: int = 0) -> NDArray[np.intp]:
-    """Return `count` indices below `total`, even and in order; where `total` is small some twice.
+    """Return `count` sorted, evenly spread indices below `total`; some repeat if it is small.
 
-    Those from the number `first` on are others than the first ones.
+    Indices from number `first` on differ from the first ones.
     """
     return (_fractions(count, first) * total).astype(np.intp)
 
 
 @lru_cache(maxsize=16)
 def _fractions(count: int, first: int) -> NDArray[np.float64]:
-    """Return so many fractions of 1, even and in order, for `even_choice`."""
-    # Multiples of the golden ratio fill an interval evenly without the
-    # regular steps that would beat with the lattice.
+    """Return `count` sorted, evenly spread fractions of 1, for `even_choice`."""
+    # Multiples of the golden ratio fill an interval evenly, without regular steps,
+    # which would alias with the lattice.
     return np.sort((np.arange(first, first + count) * 0.618033988749895) % 1.0)
 
 
 def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
     """Fill a voxel set (64, 64, 64), a solid or a shell, and measure the distance to its surface.
 
-    The distance is exact and Euclidean, to the nearest voxel centre of the other kind, less half a
-    voxel to the face between the two.
+    The distance is Euclidean and exact: to the nearest voxel centre of the other kind, less half a
+    voxel for the face between the two. `DILATION` is added to it.
     """
     from slatprep.geometry.distance import near_surface, signed_distance
 
@@ -144,7 +144,7 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
     solid = np.pad(full[box], _MARGIN)
     distance = signed_distance(solid)
     near, values = near_surface(distance, BAND)
-    # Half a voxel deep are just those that touch an empty voxel by a face.
+    # A voxel is half a voxel deep exactly if it touches an empty one by a face.
     boundary = near.take(np.flatnonzero(values == -0.5), axis=0)
     corner = np.array([side.start - _MARGIN for side in box])
     boundary += corner.astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A similarity and a deformation of it while they are fitted; lengths are in voxels."""
+"""A similarity and its deformation while they are fitted; lengths are in voxels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from slatprep.geometry.frames import VOXEL_SIZE, Array, nearest_similarity, spli
 from slatprep.records import Deformation
 
 NO_SPACING = 1e6
-"""Of a warp without a lattice."""
+"""Spacing of a warp without a lattice."""
 
 
 class Warp(NamedTuple):
@@ -40,7 +40,10 @@ class Warp(NamedTuple):
         return moved
 
     def record(self, points: Array, max_displacement: float) -> Deformation | None:
-        """Return it bounded, not folded and rounded; `points` (N, 3) are the SLAT's."""
+        """Return the warp as a bounded, rounded record without folds, or None if there is none.
+
+        `points` (N, 3) are the SLAT's; `max_displacement` is in voxels.
+        """
         affine = self.affine.copy()
         affine[:, 3] *= VOXEL_SIZE
         lattice: tuple[Array, float, Array] = np.zeros(3), 1.0, np.zeros((0, 0, 0, 3))
@@ -50,7 +53,7 @@ class Warp(NamedTuple):
         return make_deformation(affine, *lattice, points * VOXEL_SIZE, max_displacement)
 
     def as_recorded(self, kept: Deformation) -> Warp:
-        """Return it with the numbers of the deformation that `record` made of it."""
+        """Return the warp with the numbers of the deformation that `record` made of it."""
         affine = kept.affine.copy()
         affine[:, 3] /= VOXEL_SIZE
         if not kept.coefficients.size:
@@ -71,11 +74,11 @@ def places_of(pose: Similarity, warp: Warp, points: Array) -> Array:
 def from_nearest(
     pose: Similarity, warp: Warp, points: Array, scale_bounds: tuple[float, float]
 ) -> tuple[Similarity, Warp]:
-    """Return the same map as a warp of the similarity that is nearest to it.
+    """Return the same map as the similarity nearest to it, and a warp of that.
 
-    Where shapes differ much, the search comes to a similarity of another size or
-    heading, and what corrects that is no deformation. Nearest is meant over `points`
-    (N, 3) of the SLAT; the new similarity's scale stays within the bounds.
+    If shapes differ much, the search may find a similarity of another size or heading, which a
+    deformation should not correct. Nearest means least squares over `points` (N, 3) of the SLAT.
+    The new similarity's scale stays within the bounds.
     """
     moved = warp.moved(points)
     transform = nearest_similarity(points, moved)
