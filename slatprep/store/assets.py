@@ -1,6 +1,6 @@
-"""What a store says of itself, and of each asset: its id, its rows, the ``asset/*`` columns.
+"""Read what a store says of itself and of each asset: ids, rows and ``asset/*`` columns.
 
-What the metadata of an array claim is checked before anything is read of it.
+The metadata of an array are checked before the array is read.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ ASSET_COLUMNS = [
 
 
 class AttributesError(StoreError):
-    """A store whose attributes do not say what readers rely on."""
+    """A store whose attributes lack what readers rely on."""
 
 
 class AssetTable:
-    """The assets of a store as a table, which `slatprep.store.Store` adds their voxels to.
+    """The assets of a store as a table; `slatprep.store.Store` adds their voxels.
 
-    It lies at `path`, and `document` is the root's ``zarr.json``. `metadata` are those of its
-    arrays that it repeats, or that have been read since.
+    `path` is the store's place, and `document` the root's ``zarr.json``. `metadata` holds the
+    arrays' metadata that the root repeats, or that have been read since.
     """
 
     def __init__(self, path: Place, document: dict[str, Any]) -> None:
@@ -79,7 +79,7 @@ class AssetTable:
         return f"<Store {self.path}: {what}>"
 
     def _repr_html_(self) -> str:
-        """Return the store as a notebook shows it: a table of what it holds."""
+        """Return an HTML table of what the store holds, for a notebook."""
         try:
             verdicts = Counter(str(verdict) for verdict in self.cached_column("verdict"))
             rows = {
@@ -111,12 +111,12 @@ class AssetTable:
 
     @cached_property
     def about(self) -> RootAttributes:
-        """What its attributes say, typed.
+        """The store's attributes as typed values.
 
         Raises
         ------
         AttributesError
-            If they do not say what readers rely on; `open_store` has asked already.
+            If they lack what readers rely on; `open_store` has checked this already.
         """
         found = read_attributes(self.attributes)
         if isinstance(found, tuple):
@@ -125,16 +125,16 @@ class AssetTable:
 
     @property
     def contents(self) -> Contents:
-        """The tables of its properties and classes, and what its latents are."""
+        """The tables of the store's properties and classes, and its latent space."""
         return self.about.contents
 
     def columns_of(self, names: Sequence[str]) -> list[int]:
-        """Return where properties stand among its columns.
+        """Return the indices of properties among the store's property columns.
 
         Raises
         ------
         StoreError
-            If it does not have them all.
+            If the store lacks one of them.
         """
         held = list(self.about.property_columns)
         missing = [name for name in names if name not in held]
@@ -153,12 +153,12 @@ class AssetTable:
 
     @property
     def merges(self) -> bool:
-        """Whether labels of any asset are merged of several annotations."""
+        """Whether labels of any asset are merged from several annotations."""
         return all(self.holds(layout.name) for layout in MERGED)
 
     @cached_property
     def ids(self) -> list[str]:
-        """Asset ids; they ascend, but where an update added rows behind others."""
+        """Asset ids; they ascend, except where an update added rows at the end."""
         return [str(asset_id) for asset_id in self.column("id")]
 
     @cached_property
@@ -176,23 +176,23 @@ class AssetTable:
         """
         if f"asset/{name}" not in NAMES:
             raise self.no_column(name, ("id", "offset", "transform", *ASSET_COLUMNS))
-        # Offsets are always written: that they are there bounds what the others may claim.
+        # Offsets are always written, so their file limits the rows that other arrays may claim.
         rows = self.shape("asset/offset")[0] if name == "offset" else len(self)
         return self.read_rows(f"asset/{name}", 0, rows)
 
     def no_column(self, name: str, columns: Sequence[str]) -> StoreError:
-        """Return what to raise for a name that is none of the columns."""
+        """Return the error for a name that is not one of the columns."""
         close = difflib.get_close_matches(name, columns, n=1)
         hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(columns)}"
         return StoreError(f"{self.path} has no column {name!r}; {hint}")
 
     def find(self, asset_id: str) -> int:
-        """Return the index of the asset with this id, and no other.
+        """Return the index of the asset with exactly this id.
 
         Raises
         ------
         UnknownAssetError
-            If the store has no such asset; the message names those it might be.
+            If the store has no such asset; the message suggests similar ids.
         """
         if not isinstance(asset_id, str):
             raise UnknownAssetError(
@@ -203,15 +203,15 @@ class AssetTable:
         return self._index[asset_id]
 
     def match(self, name: str | int) -> int:
-        """Return the index of an asset: named by its id, by a beginning of it, or by a number.
+        """Return the index of an asset, named by its id, by a beginning of it, or by a number.
 
-        Numbers count from 0, negative ones from the end. A text of digits is a number where no
-        id begins so.
+        Numbers count from 0, negative numbers from the end. A text of digits is a number if no
+        id begins with it.
 
         Raises
         ------
         UnknownAssetError
-            If there is none, or several begin so; the message names them.
+            If no id, or several ids, begin with the name; the message names some.
         """
         return match_id(name, self._index, self.path, self._listing)
 
@@ -220,14 +220,14 @@ class AssetTable:
         return f"; `slatprep list {self.path}` shows their ids"
 
     def table(self) -> dict[str, NDArray[Any]]:
-        """Return what is known of every asset, as columns of A values.
+        """Return a table of all assets, as columns of A values.
 
         Returns
         -------
         dict of str to ndarray
-            ``id``, ``voxels``, and the ``asset/*`` arrays by their last names, but for
-            ``offset`` and ``transform``; of ``property_ambiguity`` one column a property. Those
-            of the store are read-only; copy one to change it.
+            ``id``, ``voxels``, and the arrays of `ASSET_COLUMNS` by their names;
+            ``property_ambiguity`` has one column per property. Columns from ``asset/*`` are
+            read-only; copy a column to change it.
         """
         columns = {"id": np.array(self.ids, dtype=object), "voxels": np.diff(self.offsets)}
         for name in ASSET_COLUMNS:
@@ -260,7 +260,7 @@ class AssetTable:
         return {asset_id: index for index, asset_id in enumerate(self.ids)}
 
     def cached_column(self, name: str) -> NDArray[Any]:
-        """Return an ``asset/*`` array as `column` does, read once and so read-only."""
+        """Return an ``asset/*`` array as `column` does, but read it once; it is read-only."""
         if name not in self._columns:
             self._columns[name] = self.column(name)
             self._columns[name].flags.writeable = False
@@ -282,19 +282,19 @@ class AssetTable:
 
     @cached_property
     def group(self) -> zarr.Group:
-        """The root as zarr-python has it, for everything this class does not offer.
+        """The root as a group of zarr-python, for everything that this class does not offer.
 
         Raises
         ------
         StoreError
-            If its metadata name anything that `slatprep.store.contract` does not allow.
+            If the metadata name anything that `slatprep.store.contract` does not allow.
         """
         import zarr
 
         self._refuse(f for entry in self.metadata.items() for f in gate_findings(*entry))
         remote = storage_of(self.path).remote
         try:
-            # Consolidated, so that zarr-python reads no metadata but those just looked at.
+            # Consolidated, so that zarr-python reads only the metadata that were just checked.
             with connected(remote) if remote else nullcontext():
                 return zarr.open_group(
                     str(self.path), mode="r", zarr_format=3, use_consolidated=True
@@ -303,14 +303,14 @@ class AssetTable:
             raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
 
     def holds(self, name: str) -> bool:
-        """Whether the store has an array, by its full name."""
+        """Return whether the store has an array, by its full name."""
         return name in self.metadata
 
     def reader(self, name: str) -> RowReader:
-        """Return what reads the rows of an array, by its full name.
+        """Return the reader of the rows of an array, by the array's full name.
 
-        StoreError if there is no such array, or its metadata claim another size than the contract
-        has, unreasonably large chunks, or codecs that slatprep does not use.
+        StoreError if there is no such array, or its metadata claim a size that the contract does
+        not allow, unreasonably large chunks, or codecs that slatprep does not use.
         """
         if name not in self._readers:
             self._readers[name] = self._checked(name)
@@ -328,7 +328,7 @@ class AssetTable:
         own = self.metadata[name]
         self._refuse(contract.size_findings(name, own, sizes))
         self._refuse(gate_findings(name, own))
-        # So many assets cost memory by themselves.
+        # A large number of assets costs memory by itself, so the files must account for it.
         if sizes["asset"] > ASSET_CHUNK and sizes["asset"] * contract.MIN_ASSET_BYTES > self._bytes:
             raise StoreError(
                 f"{self.path} has {sizes['asset']} assets in {self._bytes} bytes; expected at "
@@ -354,7 +354,7 @@ class AssetTable:
 def match_id(name: str | int, rows: Mapping[str, int], where: object, listing: str = "") -> int:
     """Return the row that a name means, as `AssetTable.match` does; `rows` are by id.
 
-    UnknownAssetError tells `where` the ids are, and `listing`, what shows them.
+    UnknownAssetError names `where` the ids are, and has `listing`, a hint at how to list them.
     """
     if not isinstance(name, str):
         return _numbered(operator.index(name), rows, where)
@@ -383,7 +383,7 @@ def _numbered(number: int, rows: Mapping[str, int], where: object) -> int:
 
 
 def _unknown(name: str, rows: Mapping[str, int], where: object, listing: str) -> UnknownAssetError:
-    """Return the error that offers ids which `name` might mean."""
+    """Return the error for an unknown name; it suggests similar ids."""
     alike = name.casefold()
     begun = [known for known in rows if alike and known.casefold().startswith(alike)]
     close = begun or difflib.get_close_matches(name, rows)

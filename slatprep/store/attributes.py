@@ -1,4 +1,4 @@
-"""What the attributes of a store's root say, as typed values; no others are used."""
+"""Attributes of a store's root as typed values; readers use no others."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ class StoredRange:
 
 @dataclass(frozen=True)
 class StoredAlign:
-    """What readers ask of the parameters of alignment: the correspondence radius [voxel]."""
+    """The parameter of alignment that readers need: the correspondence radius [voxel]."""
 
     radius: Length
 
 
 @dataclass(frozen=True)
 class StoredSample(SampleParameters):
-    """The parameters of the lookup, but for those that only newer versions know."""
+    """The parameters of the lookup; those that only newer versions know are ignored."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "ignore", "allow_inf_nan": False}
 
 
 @dataclass(frozen=True)
 class StoredParameters:
-    """What readers ask of the parameters of a build."""
+    """The parameters of a build that readers need."""
 
     align: StoredAlign
     sample: StoredSample
@@ -66,7 +66,7 @@ class StoredBuild:
 
 @dataclass(frozen=True)
 class RootAttributes:
-    """What readers rely on; attributes that they do not know are left alone.
+    """The attributes that readers rely on; unknown attributes are ignored.
 
     `slatprep.store.writer.finish_store` writes them.
     """
@@ -96,14 +96,14 @@ class RootAttributes:
 
     @property
     def ranges(self) -> records.Normalization:
-        """The ranges as other stages have them."""
+        """The ranges as a record."""
         entries = [(name, self.normalization[name]) for name in self.property_columns]
         ranges = tuple(records.PropertyRange(name, e.log10, e.lo, e.hi) for name, e in entries)
         return records.Normalization(ranges, entries[0][1].source)
 
     @property
     def contents(self) -> records.Contents:
-        """What the store holds, as other stages have it."""
+        """The store's properties, classes and latent space, as a record."""
         properties = (
             records.Property(name, unit, self.normalization[name].log10)
             for name, unit in zip(self.property_columns, self.property_units, strict=True)
@@ -112,7 +112,7 @@ class RootAttributes:
 
 
 def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Finding, ...]:
-    """Return the attributes of a root as typed values, or all that is wrong with them."""
+    """Return the attributes of a root as typed values, or a finding for each fault."""
     from pydantic import ValidationError
 
     try:
@@ -126,7 +126,7 @@ def read_attributes(attributes: Mapping[str, Any]) -> RootAttributes | tuple[Fin
 
 
 def width_findings(said: RootAttributes, metadata: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield arrays, by their metadata, that have other columns than the attributes say."""
+    """Yield a finding for each array whose number of columns differs from the attributes."""
     for name, attribute, columns in (
         ("voxel/feats", "latents", said.latents.channels),
         ("voxel/properties", "property_columns", len(said.property_columns)),
@@ -139,7 +139,7 @@ def width_findings(said: RootAttributes, metadata: Mapping[str, Any]) -> Iterato
 
 
 def segments_of(ids: Sequence[str]) -> list[int]:
-    """Return the rows at which ids begin to ascend anew: 0, and those that updates added.
+    """Return the first row of each segment: 0, and rows with a smaller id than the row before.
 
     >>> segments_of(["a", "d", "b", "c"])
     [0, 2]
@@ -150,7 +150,7 @@ def segments_of(ids: Sequence[str]) -> list[int]:
 def store_attributes(
     normalization: records.Normalization, build: Mapping[str, object], contents: records.Contents
 ) -> dict[str, Any]:
-    """Return the attributes of a store's root that decide its bytes, but for what its rows tell.
+    """Return the attributes of a store's root that decide its bytes, except those of its rows.
 
     `build` holds the parameters and versions that made the content, so that
     a store is understood without its manifests.

@@ -1,11 +1,11 @@
-"""What a store's metadata must say, so that whoever reads it can rely on it.
+"""Contract for a store's metadata, on which readers rely.
 
-A store may come from a stranger. These checks cost no read beyond the root's
-``zarr.json`` and bound what any later read can claim.
+A store may come from a stranger. These checks read nothing but the root's
+``zarr.json``, and limit how much any later read can allocate.
 
-zarr-python looks codecs and data types up by the names that it finds, among them
-some that unpickle, and takes arrays of format 2 from consolidated metadata. So metadata are held
-against lists of what a store may name before zarr-python sees any of it.
+zarr-python resolves codecs and data types by the names that it finds, including some that
+unpickle, and takes arrays of format 2 from consolidated metadata. So all names in the metadata are
+compared with lists of allowed names before zarr-python sees them.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from slatprep.storage.documents import read_document
 from slatprep.store.layout import ASSET_CHUNK, COORDINATES, FILE, FIXED_SIZES, LAYOUTS, ArrayLayout
 
 MAX_METADATA_BYTES = 16 * 2**20
-"""No zarr.json is larger: all metadata of a store take about 50 kB."""
+"""Largest size of a zarr.json; all metadata of a store take about 50 kB."""
 
 MAX_VOXELS = RESOLUTION**3
-"""Rows of one asset: each coordinate occurs once."""
+"""Largest number of rows of one asset: each coordinate occurs once."""
 
 MAX_ASSETS, MAX_FILES = 2**24, 2**20
 
 DEFINING = ("asset/id", "voxel/coords", "voxel/feats", "voxel/properties")
-"""Arrays whose shapes say how many assets, voxels, channels and properties there are."""
+"""Arrays whose shapes give the numbers of assets, voxels, channels and properties."""
 
 MIN_ASSET_BYTES = 256
-"""No asset takes less of a store's files: its record alone, packed, has more. By this the number
-of assets that a store claims is held against the bytes of its files."""
+"""Least size of an asset in a store's files: its packed record alone is larger. It limits how many
+assets a store may claim for the size of its files."""
 
 _MAX_CHUNK_ROWS = {"asset": ASSET_CHUNK, "voxel": MAX_VOXEL_CHUNK, "grid": 16, FILE: MAX_FILES}
 _MAX_SHARD_ROWS = {**_MAX_CHUNK_ROWS, "voxel": MAX_VOXEL_SHARD, "grid": MAX_GRID_SHARD}
@@ -42,10 +42,10 @@ _ZARR_NAMES = {"str": "string"}
 
 @dataclass(frozen=True, order=True)
 class Finding:
-    """One thing that is wrong, and what should be there.
+    """One fault, and what is expected instead.
 
-    `file` lies below the store, or is one of the records or sources. `asset` is empty where the
-    store as a whole is concerned. `what` is wrong is told with the value at fault.
+    `file` lies below the store, or is one of the records or sources. `asset` is empty if the fault
+    concerns the whole store. `what` tells the fault with the value.
     """
 
     file: str
@@ -59,7 +59,7 @@ class Finding:
 
 
 def read_metadata(path: Place) -> dict[str, Any]:
-    """Read a ``zarr.json``; StoreError if it is missing, or no JSON object within bounds."""
+    """Read a ``zarr.json``; StoreError if it is missing, too large or not a JSON object."""
     try:
         return read_document(path, MAX_METADATA_BYTES)
     except (OSError, ValueError) as error:
@@ -76,7 +76,7 @@ def array_findings(
         "data_type": _ZARR_NAMES.get(layout.dtype, layout.dtype),
         "dimension_names": list(layout.dimensions),
         "zarr_format": 3,
-        "fill_value": empty if empty == empty else "NaN",  # which differs from itself
+        "fill_value": empty if empty == empty else "NaN",  # NaN differs from itself.
     }
     yield from _misformed(f"{layout.name}/zarr.json", metadata, wanted)
 
@@ -84,8 +84,8 @@ def array_findings(
 def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iterator[Finding]:
     """Yield what is wrong with the sizes that the metadata of one array claim.
 
-    `sizes` are `dimension_sizes`; of arrays that are not in the contract nothing is asked. An array
-    without findings may be read: no more memory is set aside than its files account for.
+    `sizes` are `dimension_sizes`. Arrays outside the contract are not checked. An array without
+    findings may be read: reading allocates no more memory than its files account for.
     """
     layout = LAYOUTS.get(name)
     if layout is None:
@@ -100,7 +100,7 @@ def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iter
 
 
 def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
-    """Return the size of every dimension from the arrays that define it, else StoreError."""
+    """Return the size of every dimension, from the array that defines it; StoreError if none."""
     sizes = dict(FIXED_SIZES)
     for name, dimension, limit in (
         ("asset/id", "asset", MAX_ASSETS),
@@ -156,7 +156,7 @@ NAMES = frozenset(
 DATA_TYPES = ("bool", "uint8", "int64", "float32", "float64", "string")
 
 CODECS = ("bytes", "vlen-utf8", "blosc", "zstd", "crc32c", "sharding_indexed")
-"""What a store is packed with; none of these can run code."""
+"""Codecs that a store may use; none of them can run code."""
 
 _KEYS = frozenset(
     ("zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding",
@@ -183,7 +183,7 @@ _SETTINGS: dict[str, Any] = {
         "index_location": "end",
     },
 }
-"""Configurations of codecs, see `_has_form`; those of others are empty."""
+"""Forms (see `_has_form`) of codecs' configurations; other codecs have empty ones."""
 
 _GATE: dict[str, Any] = {"zarr_format": 3, "attributes": dict}
 _ARRAY_GATE: dict[str, Any] = {
@@ -194,7 +194,7 @@ _ARRAY_GATE: dict[str, Any] = {
 
 
 def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
-    """Yield what is not allowed in the ``zarr.json`` of an array or group, or the root's copy."""
+    """Yield what is not allowed in the ``zarr.json`` of an array or group, or in its root copy."""
     where, kinds = f"{name}/zarr.json", {"array": NAMES, "group": GROUPS}
     kind = str(metadata.get("node_type")) if isinstance(metadata, Mapping) else ""
     if not isinstance(metadata, Mapping) or name not in kinds.get(kind, ()):
@@ -203,7 +203,7 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
         return
     yield from _misformed(where, {"attributes": {}, **metadata}, _GATE)
     if kind == "group":
-        # zarr-python would take arrays from here that nobody has looked at.
+        # zarr-python would take unchecked arrays from here.
         nested = metadata.get("consolidated_metadata")
         empty = isinstance(nested, Mapping) and nested.get("metadata") == {}
         if not (nested is None or empty):
@@ -217,7 +217,7 @@ def gate_findings(name: str, metadata: object) -> Iterator[Finding]:
 
 
 def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield what the ``zarr.json`` of an array says otherwise than Zarr writes it."""
+    """Yield differences of an array's ``zarr.json`` from the form that Zarr writes."""
     if metadata.get("node_type") != "array":
         return
     where = f"{name}/zarr.json"
@@ -235,14 +235,14 @@ def form_findings(name: str, metadata: Mapping[str, Any]) -> Iterator[Finding]:
 def _misformed(
     where: str, metadata: Mapping[str, Any], forms: Mapping[str, Any]
 ) -> Iterator[Finding]:
-    """Yield the entries that have another form, see `_has_form`."""
+    """Yield a finding for each entry that lacks its form; see `_has_form`."""
     for key, form in forms.items():
         if not _has_form(metadata.get(key), form):
             yield Finding(where, "", f"{key} is {metadata.get(key)!r}", _in_words(form))
 
 
 def _has_form(value: Any, form: Any) -> bool:
-    """Whether a value of JSON has a form: a type, an object of forms, one of some, or a value."""
+    """Return whether a JSON value has a form: a type, a value, alternatives or an object."""
     if isinstance(form, dict):
         whole = isinstance(value, dict) and value.keys() == form.keys()
         return whole and all(_has_form(value[key], form[key]) for key in form)
@@ -266,7 +266,7 @@ def _in_words(form: Any) -> str:
 
 
 def _codecs(codecs: Any) -> Iterator[Mapping[str, Any]]:
-    """Yield codecs and those within them; an empty one where there is none."""
+    """Yield codecs and the codecs within them; an empty mapping replaces a malformed codec."""
     for codec in codecs if isinstance(codecs, list) else [None]:
         known = codec if isinstance(codec, Mapping) else {}
         yield known

@@ -1,8 +1,8 @@
-"""The files of a store: their metadata against the contract, their bytes against its digests.
+"""Check the files of a store: their metadata by the contract, their bytes by the store's digests.
 
-``file/name``, ``file/size`` and ``file/sha256`` say what every file held when the store was
-finished: all but the root's ``zarr.json`` and the three arrays themselves, which carry checksums of
-their own. Of the root's ``zarr.json`` they hold the attributes' digest, under `ATTRIBUTES`; the
+``file/name``, ``file/size`` and ``file/sha256`` describe each file as it was when the store was
+finished. They leave out the root's ``zarr.json``, and themselves, as they carry checksums of their
+own. From the root's ``zarr.json`` they hold the digest of the attributes, under `ATTRIBUTES`; the
 rest of it repeats the ``zarr.json`` of the arrays.
 """
 
@@ -49,10 +49,10 @@ def write_digests(
 ) -> None:
     """Add the digests of all files to a store that is otherwise complete.
 
-    What no array accounts for is removed first. Root attributes are written, metadata not yet
-    consolidated. `known` has digests of files that need not be read again, `elsewhere` the bytes of
-    files that are not here, but where the store will lie. StoreError if a file of an array is
-    missing.
+    Files that belong to no array are removed first. The root's attributes must be written, and the
+    metadata must not be consolidated yet. `known` has digests of files that need not be read again.
+    `elsewhere` has the sizes [byte] of files that already lie at the final place. StoreError if a
+    file of an array is missing.
     """
     root = open_for_writing(path)
     meant = dict(_files_of(root))
@@ -70,7 +70,7 @@ def write_digests(
     names.append(ATTRIBUTES)
     sizes.append(len(_canonical(attributes)))
     digests.append(attributes_digest(attributes))
-    # Row by row these are small; one chunk holds all of a large store's.
+    # The rows are small: one chunk holds even those of a large store.
     columns = (np.array(names, object), np.array(sizes, np.int64), np.array(digests, object))
     for layout, values in zip(FILES, columns, strict=True):
         add_array(root, layout.name, values, "file", layout.description, level=1)
@@ -84,19 +84,19 @@ def open_for_writing(path: Path) -> Any:
 
 
 def attributes_digest(attributes: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of attributes, in hex, however their JSON is laid out."""
+    """Return the SHA-256 of attributes, in hex; the layout of their JSON has no effect."""
     return hashlib.sha256(_canonical(attributes)).hexdigest()
 
 
 def _files_of(root: Any) -> Iterator[tuple[str, bool]]:
-    """Yield the files of a store by its metadata, and whether each must be there."""
+    """Yield each file that a store may have by its metadata, and whether it must exist."""
     for path, node in root.members(max_depth=None):
         yield f"{path}/zarr.json", True
-        if hasattr(node, "chunks"):  # an array, no group
+        if hasattr(node, "chunks"):  # not a group
             rows = (node.shards or node.chunks)[0]
             for number in range(-(-node.shape[0] // rows)):
                 key = node.metadata.encode_chunk_key((number,) + (0,) * (node.ndim - 1))
-                # Zarr leaves out files of fill values alone, as a column of empty strings is.
+                # Zarr writes no file for fill values alone, such as a column of empty strings.
                 yield f"{path}/{key}", not path.startswith("asset/")
 
 
@@ -107,7 +107,7 @@ def _canonical(attributes: Mapping[str, Any]) -> bytes:
 def add_array(
     group: Any, name: str, values: NDArray[Any], dimension: str, description: str, level: int = 0
 ) -> None:
-    """Add a small array (N,) of numbers, or texts as objects, in one chunk."""
+    """Add a small array (N,) of numbers, or of strings (dtype object), in one chunk."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     array = group.create_array(
@@ -123,7 +123,7 @@ def add_array(
 
 
 def metadata_findings(path: Place) -> Iterator[Finding]:
-    """Yield where the metadata differ from the contract, or their two copies from each other."""
+    """Yield differences of the metadata from the contract, and between their two copies."""
     root = read_metadata(path / "zarr.json")
     said = read_attributes(root["attributes"])
     yield from said if isinstance(said, tuple) else ()
@@ -172,17 +172,17 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
 
 
 def digests_in(store: Store) -> dict[str, Written]:
-    """Return bytes and SHA-256 of the files of a store by name, as it holds them."""
+    """Return the size and SHA-256 that a store holds of each of its files, by name."""
     files = store.shape(f"{FILE}/name")[0]
     columns = (store.read_rows(layout.name, 0, files).tolist() for layout in FILES)
     return {name: Written(*told) for name, *told in zip(*columns, strict=True)}
 
 
 def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[Finding]]:
-    """Compare every file of a store, or those whose names begin with `below`, with its digest.
+    """Compare every file of a store, or each whose name begins with `below`, with its digest.
 
-    Of the others the sizes are compared. Returns how many files the store has, those of the digests
-    themselves included, and what is missing, additional or changed.
+    Other files are compared by size. Return the number of files of the store, including those of
+    the digests, and findings on missing, additional and changed files.
     """
     try:
         expected = digests_in(store)
@@ -223,7 +223,7 @@ def _compared(
 
 
 def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tuple[str, str, str]:
-    """Return a file's name, what is wrong with it, and its digest."""
+    """Return a file's name, its fault (empty if there is none), and its digest."""
     if found < 0:
         return name, "is a link" if found == LINK else "is no regular file", ""
     if found != size:
@@ -240,12 +240,12 @@ _CONSOLIDATED = {"kind": "inline", "must_understand": False, "metadata": 0}
 
 
 def _same(own: Mapping[str, Any], copy: object) -> bool:
-    """Whether metadata equal their consolidated copy; groups may repeat an empty consolidation."""
+    """Return whether metadata equal their copy; groups may have an empty consolidation."""
     if not isinstance(copy, dict):
         return False
     left, right = ({**one, "consolidated_metadata": None} for one in (own, copy))
     nested = [one.get("consolidated_metadata") for one in (own, copy)]
     if any(one not in (None, {**_CONSOLIDATED, "metadata": {}}) for one in nested):
         return False
-    # A fill value of NaN does not equal its copy, but is written like it.
+    # A fill value of NaN does not equal its copy, but has the same repr.
     return left == right or repr(left) == repr(right)

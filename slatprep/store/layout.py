@@ -1,8 +1,8 @@
-"""What lies where in the store: arrays, chunks, shards.
+"""Layout of the store: arrays, chunks, shards.
 
-The tables of arrays are `ARRAYS` and `MERGED`; writer and reader take names, types and
-shapes from them. Rows of ``voxel/*`` and ``grid/*`` are cut into shards by
-`row_ranges`, and `overlaps` says which assets lie in one.
+`ARRAYS` and `MERGED` list the arrays; writer and reader take names, types and
+shapes from them. `row_ranges` cuts rows of ``voxel/*`` and ``grid/*`` into shards, and `overlaps`
+finds the assets in a shard.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from slatprep.records import BACKGROUND, RESOLUTION, UNANNOTATED
 
 FORMAT = "slatprep-store"
 FORMAT_VERSION = 1
-"""The format that is written and read."""
+"""Version of the format that is written and read."""
 
 ASSET_CHUNK = 65_536
-"""Assets in one chunk of the ``asset/*`` arrays."""
+"""Number of assets in one chunk of the ``asset/*`` arrays."""
 
 FILE = "file"
-"""Group of the digests."""
+"""Group of the arrays of digests."""
 
 RECORD_ARRAY = "asset/record"
-"""The record of each row, as JSON. It is replaced in one step with the arrays it belongs to, the
-lines of ``assets.jsonl`` are made from it, and it is what the next build compares with."""
+"""Array of each row's record, as JSON. It is replaced in one step with the arrays it belongs to.
+The lines of ``assets.jsonl`` are made from it, and the next build compares with it."""
 
 MAX_RECORD_BYTES = 2**20
-"""No record is larger; most take some 10 kB."""
+"""Largest size of a record; most take some 10 kB."""
 
 RECORDS_IN_CHUNK = 64
 RECORDS_IN_SHARD = 1024
-"""About 10 MB of text: what the parent holds at a time."""
+"""Number of records in a shard: about 10 MB of text, which the parent holds at a time."""
 
 NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class ArrayLayout:
-    """One array of the store: its type, its dimensions, what it means and how it is packed.
+    """One array of the store: its type, dimensions, meaning and packing.
 
-    `packing` is ``zstd``, the smallest, or what unpacks fastest: ``repeats``
-    for values that recur, ``columns`` for rows of three bytes of which two
-    recur, ``exponents`` for floats of which little else recurs. An `internal` array
-    is kept for the next build, and describes no asset to a reader.
+    `packing` ``zstd`` takes the least space. The others unpack fastest: ``repeats`` values that
+    recur, ``columns`` rows of three bytes of which two recur, ``exponents`` floats that share
+    little but exponents. An `internal` array serves the next build and describes no asset to a
+    reader.
     """
 
     name: str
@@ -63,11 +63,11 @@ class ArrayLayout:
 _XYZ = ("x", "y", "z")
 
 _EMPTY: dict[str, Any] = {"str": "", "float64": NAN, "float32": NAN, "bool": False}
-"""What an array of a type has where nothing is written, if it is not 0 or the array's own."""
+"""Fill value by type; other types have 0, unless an array has its own."""
 
 
 def _asset(name: str, dtype: str, description: str, of: str = "", **more: Any) -> ArrayLayout:
-    """Return an array of ``asset/*``; `of` are its dimensions behind the first."""
+    """Return an array of ``asset/*``; `of` names its dimensions after the first."""
     dimensions = ("asset", *of.split())
     return ArrayLayout(
         f"asset/{name}", dtype, dimensions, _EMPTY.get(dtype, 0), description, **more
@@ -80,7 +80,7 @@ _kept = partial(_asset, internal=True)
 def _voxel(
     name: str, packing: str, dtype: str, description: str, of: str = "", **more: Any
 ) -> ArrayLayout:
-    """Return an array of ``voxel/*``; `of` are its dimensions behind the first."""
+    """Return an array of ``voxel/*``; `of` names its dimensions after the first."""
     more = {"fill_value": _EMPTY.get(dtype, 0), "packing": packing, **more}
     dimensions = ("voxel", *of.split())
     return ArrayLayout(f"voxel/{name}", dtype, dimensions, description=description, **more)
@@ -152,7 +152,7 @@ ARRAYS = (
     ArrayLayout("grid/material", "uint8", ("asset", *_XYZ), BACKGROUND,
         "class, 255 occupied but not annotated, background 7 or the store's attribute background"),
 )  # fmt: skip
-"""Every array of any store."""
+"""Arrays that every store has, besides `RECORDS` and `FILES`."""
 
 MERGED = (
     _voxel("spread", "exponents", "float32",
@@ -161,7 +161,7 @@ MERGED = (
     _voxel("votes", "repeats", "float32",
         "share of the annotations that give the class, 0 where not valid, NaN where not several"),
 )  # fmt: skip
-"""Further arrays of a store in which labels of any asset are merged of several annotations."""
+"""Further arrays of a store if labels of any asset are merged from several annotations."""
 
 RECORDS = ArrayLayout(RECORD_ARRAY, "str", ("asset",), "", "provenance of the row, as JSON")
 
@@ -173,19 +173,19 @@ FILES = (
 """Digests of the store's files; see `slatprep.store.integrity`."""
 
 LAYOUTS = {layout.name: layout for layout in (*ARRAYS, *MERGED, RECORDS, *FILES)}
-"""Every array that a store may have, by name, but for the coordinates of its dimensions."""
+"""Every array that a store may have, by name, except the coordinates of its dimensions."""
 
 MERGED_COLUMNS = tuple(layout.name.removeprefix("voxel/") for layout in MERGED)
 """Last names of the arrays of `MERGED`."""
 
 
 def arrays_with(merged: bool) -> tuple[ArrayLayout, ...]:
-    """Return every array of a store that is written, whether or not it has `MERGED`."""
+    """Return the arrays of a store; `merged` adds `MERGED`."""
     return (*ARRAYS, *MERGED) if merged else ARRAYS
 
 
 COORDINATES = {"asset": ("property",), "voxel": ("axis", "property"), "grid": ("property", *_XYZ)}
-"""Dimensions of each group that an array of their name gives coordinates, such as for xarray."""
+"""Dimensions of each group that have coordinates, in an array of the same name, as for xarray."""
 
 FIXED_SIZES = {
     "row": 4,
@@ -195,21 +195,21 @@ FIXED_SIZES = {
     "bound": 2,
     **dict.fromkeys(_XYZ, RESOLUTION),
 }
-"""Dimensions that are the same in every store."""
+"""Sizes of the dimensions that are the same in every store."""
 
 MOST_SHARDS = 32
-"""Shards of a voxel array of a store that is not very large. An update writes the last one anew,
-and a reader keeps so many open."""
+"""Largest number of shards of a voxel array, unless the store is very large. An update writes the
+last shard anew, and a reader keeps this number open."""
 
 _CHUNKS_IN_SHARD = 64, 4_096
-"""Least and most chunks of a shard where parameters name no number. Of the usual chunks these are
-some 10 and 700 MB in all arrays together."""
+"""Least and largest number of chunks in a shard if parameters give none. With chunks of the usual
+size these take some 10 and 700 MB in all arrays together."""
 
 
 def rows_per_shard(parameters: StoreParameters, n_voxels: int) -> int:
-    """Return how many voxel rows one shard holds, in a store of so many.
+    """Return the number of voxel rows per shard in a store of `n_voxels`.
 
-    Where parameters do not say, it is a power of two of chunks, so that updates seldom change it.
+    If parameters give none, it is a power of two of chunks, so that updates seldom change it.
     """
     chunks = parameters.voxel_chunks_per_shard
     if not chunks:
@@ -231,15 +231,15 @@ def row_ranges(total: int, per_shard: int) -> Iterator[tuple[int, int]]:
 
 
 def edges_of(group: str, offsets: Sequence[int]) -> Sequence[int]:
-    """Return the first row of each asset in arrays of a group, and the last one's end.
+    """Return the first row of each asset in arrays of a group, and the end of the last asset.
 
-    Of arrays other than ``voxel/*``, where `offsets` are those, an asset has one row.
+    In ``voxel/*`` these are `offsets`; in other arrays an asset has one row.
     """
     return offsets if group == "voxel" else range(len(offsets))
 
 
 def overlaps(offsets: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, slice]]:
-    """Yield which assets own the rows ``start:stop``, and which of their own rows those are.
+    """Yield each asset with rows in ``start:stop``, and the slice of its own rows that these are.
 
     Asset a owns rows ``offsets[a]:offsets[a+1]``.
 

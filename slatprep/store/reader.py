@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 TRAINING_COLUMNS = ("coords", "feats", "properties")
-"""What `Store.read` reads unless told otherwise."""
+"""Columns that `Store.read` reads by default."""
 
 VOXEL_COLUMNS = tuple(
     name
@@ -44,8 +44,8 @@ VOXEL_COLUMNS = tuple(
 class StoredAsset:
     """One asset as the store holds it; properties are normalised.
 
-    The PixieVerse side, `grid_properties`, `grid_material` and `field`, is read
-    when it is first asked for, and may then raise `StoreError`.
+    The PixieVerse side (`grid_properties`, `grid_material` and `field`) is read
+    on first access, which may raise `StoreError`.
 
     Attributes
     ----------
@@ -56,30 +56,30 @@ class StoredAsset:
     asset_id : str
         Id of the row.
     coords : ndarray of uint8, shape (N, 3)
-        SLAT voxels of the encoder's grid; ``latents.centres`` says where they lie.
+        SLAT voxels of the encoder's grid; ``latents.centres`` has their positions.
     feats : ndarray of float32, shape (N, channels)
-        Their latents; ``store.contents.latents`` says what they are.
+        Latents of the voxels; ``store.contents.latents`` describes them.
     properties : ndarray of float32, shape (N, P)
         The store's properties in [-1, 1]; NaN where not valid.
     material : ndarray of uint8, shape (N,)
-        Class, a place in ``store.contents.labels``; 255 where not valid.
+        Class, an index into ``store.contents.labels``; 255 where not valid.
     valid : ndarray of bool, shape (N,)
         Whether an annotation was found near enough.
     distance : ndarray of float32, shape (N,)
-        Voxels to the annotation used.
+        Distance to the annotation used [voxel].
     confidence : ndarray of float32, shape (N,)
-        How likely the class is right, 0 where not valid.
+        Probability that the class is right; 0 where not valid.
     place : ndarray of float32, shape (N, 3)
-        Where each voxel was looked up, in the PixieVerse frame.
+        Point of the PixieVerse frame at which each voxel's labels were read.
     spread : ndarray of float32, shape (N, P)
-        Standard deviation of each normalised property over the annotations that the labels
-        are merged of, NaN where fewer than two are valid.
+        Standard deviation of each normalised property over the annotations from which the
+        labels are merged; NaN where fewer than two are valid.
     votes : ndarray of float32, shape (N,)
         Share of the valid annotations that give the class, 0 where none is valid; NaN where
         the asset has one annotation.
     transform : ndarray of float64, shape (4, 4)
-        PixieVerse frame to SLAT frame, a similarity; a deformation that follows
-        it is in the record, see `slatprep.store.records.StoredRecords.place_map`.
+        Similarity from the PixieVerse frame to the SLAT frame. The record has the deformation that
+        follows it, if any; see `slatprep.store.records.StoredRecords.place_map`.
     columns : dict
         The asset's row of every other ``asset/*`` array, by the array's last
         name: ``fitness``, ``verdict``, ``category``, ...
@@ -106,32 +106,32 @@ class StoredAsset:
         return f"<StoredAsset {self.asset_id}: {what}, {amount(len(self.coords), 'voxel')}>"
 
     def plot(self) -> Image:
-        """Draw it as ``slatprep check-alignment`` does; a notebook shows the picture.
+        """Draw the asset as ``slatprep check-alignment`` does; a notebook shows the picture.
 
         StoreError if its record cannot be read.
         """
-        # Pictures stand floors above the store, whose face is where people look for them.
+        # Pictures belong to a room above the store, but people look for them here.
         picture = pkgutil.resolve_name("slatprep.inspect.pictures.write:picture_of")
         return cast("Image", picture(self))
 
     @property
     def merged(self) -> bool:
-        """Whether its labels are merged of several annotations."""
+        """Whether the asset's labels are merged from several annotations."""
         return not np.isnan(self.votes[:1]).all()
 
     @cached_property
     def latents(self) -> StructuredLatents:
-        """Its SLAT, as it was read."""
+        """The asset's SLAT, as it was read from its source."""
         return self.store.latents_of(self.coords, self.feats)
 
     @cached_property
     def cells(self) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """The cells of the 64^3 grid that it occupies, and their voxels; see `shown_in_cells`."""
+        """Cells of the 64^3 grid that the asset occupies, and a voxel of each; `shown_in_cells`."""
         return shown_in_cells(self.coords, self.store.contents.latents.resolution)
 
     @cached_property
     def properties_si(self) -> NDArray[np.float32]:
-        """Properties in SI units, (N, P), by ``store.contents``; NaN where not valid."""
+        """Properties of ``store.contents`` in SI units, (N, P); NaN where not valid."""
         return denormalize_properties(self.properties, self.store.normalization)
 
     @cached_property
@@ -146,7 +146,7 @@ class StoredAsset:
 
     @cached_property
     def normalised_field(self) -> MaterialField:
-        """The PixieVerse field that the asset was made of, its properties in [-1, 1]."""
+        """The PixieVerse field that the asset was made from, with properties in [-1, 1]."""
         contents, material = self.store.contents, self.grid_material.reshape(-1)
         cells = np.flatnonzero(material < contents.background)
         return MaterialField(
@@ -160,7 +160,7 @@ class StoredAsset:
 
     @cached_property
     def field(self) -> MaterialField:
-        """The same in SI units."""
+        """The PixieVerse field that the asset was made from, with properties in SI units."""
         own = self.normalised_field
         properties = denormalize_properties(own.properties, self.store.normalization)
         return replace(own, properties=properties)
@@ -169,13 +169,13 @@ class StoredAsset:
 class Store(AssetTable):
     """A store opened for reading; `open_store` makes one.
 
-    Threads and forked processes may share it; pickled, it opens the same path
+    Threads and forked processes may share it; a pickled store opens the same path
     again.
 
     Parameters
     ----------
     path : Place
-        Where it lies.
+        Place of the store.
     document : dict
         The root's ``zarr.json``.
     """
@@ -200,7 +200,7 @@ class Store(AssetTable):
     def read(
         self, index: str | int, columns: Sequence[str] = TRAINING_COLUMNS
     ) -> dict[str, NDArray[Any]]:
-        """Read rows of ``voxel/*`` of one asset: the fast way, made for training.
+        """Read rows of ``voxel/*`` of one asset, fast, as training needs it.
 
         Parameters
         ----------
@@ -224,8 +224,8 @@ class Store(AssetTable):
         start, stop = self.rows(self.match(index) if isinstance(index, str) else index)
         if storage_of(self.path).local is not None:
             return {name: self._voxel_rows(name, start, stop) for name in columns}
-        # Each array is an object of its own, and an answer takes long to come. Threads that were
-        # kept for the next call would not be there in a forked process.
+        # Each array is an object of its own, and each answer takes long, so all are asked for at
+        # once. Threads that were kept for the next call would be missing in a forked process.
         with ThreadPoolExecutor(max(len(columns), 1)) as pool:
             read = pool.map(lambda name: self._voxel_rows(name, start, stop), columns)
             return dict(zip(columns, read, strict=True))
@@ -233,7 +233,7 @@ class Store(AssetTable):
     def latents_of(
         self, coords: NDArray[np.uint8], feats: NDArray[np.float32]
     ) -> StructuredLatents:
-        """Return voxels (N, 3) and their latents (N, channels), as `read` gives them, as a SLAT."""
+        """Return a SLAT of voxels (N, 3) and latents (N, channels), as `read` returns them."""
         space = self.contents.latents
         return StructuredLatents(
             coords, feats, standardised=space.standardised, resolution=space.resolution
@@ -245,7 +245,7 @@ class Store(AssetTable):
         Raises
         ------
         StoreError
-            If there is no such asset, or its rows make no sense.
+            If there is no such asset, or its rows are invalid.
         """
         if not 0 <= index < len(self):
             raise StoreError(f"{self.path} has no asset {index}; it has {len(self)} assets")
@@ -258,9 +258,9 @@ class Store(AssetTable):
         return start, stop
 
     def asset(self, name: str | int) -> StoredAsset:
-        """Return one asset, by its id, a beginning that no other id has, or its number.
+        """Return one asset, by its id, a unique beginning of its id, or its number.
 
-        ``store[name]`` does the same; see `match`. The grid is read when it is first asked for.
+        ``store[name]`` does the same; see `match`. The grid is read on first access.
 
         Raises
         ------
@@ -298,23 +298,23 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
     Parameters
     ----------
     path : str or Place
-        The store's directory, or its URL on an object store. There the version
-        that is current now is opened, and stays open when it is replaced. A
-        store that is open is returned as it is.
+        The store's directory, or its URL on an object store. On an object store
+        the current version is opened, and stays open when it is replaced. An
+        open store is returned as it is.
     copy : bool
-        Copy a store on an object store to the local disk first, if that has
-        not been done before: for training, which reads it many times.
+        Copy a store from an object store to the local disk first, unless that
+        was done before. This suits training, which reads the store many times.
 
     Returns
     -------
     Store
-        Nothing but one file of metadata has been read.
+        The open store; only one file of metadata has been read.
 
     Raises
     ------
     StoreError
-        If there is nothing, something else, a store of a newer format, or one
-        whose attributes do not say what they must.
+        If there is no store, its format has another version, or its attributes
+        are invalid.
     """
     if isinstance(path, Store):
         return path
@@ -335,14 +335,14 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
             "Use the slatprep that wrote it, or a newer one"
         )
     store = Store(path.absolute(), document)  # The working folder may change.
-    # Refused when opened, not halfway through a command.
+    # A store is refused when it is opened, not halfway through a command.
     for finding in width_findings(store.about, store.metadata):
         raise AttributesError(f"{path}/{finding}; run `slatprep verify`")
     return store
 
 
 def is_store(path: Place) -> bool:
-    """Whether a slatprep store of any format version lies at a place itself."""
+    """Return whether a place itself is a slatprep store of any format version."""
     try:
         attributes = _root_document(path).get("attributes", {})
     except StoreError:
@@ -351,9 +351,9 @@ def is_store(path: Place) -> bool:
 
 
 def require_outside(out: Path) -> None:
-    """Raise unless a path that something is to be written to lies outside of every store.
+    """Raise unless an output path lies outside of every store.
 
-    ConfigError if it is a store, lies inside one, or cannot be looked at.
+    ConfigError if it is a store, lies inside a store, or cannot be read.
     """
     try:
         target = out.resolve()
@@ -368,7 +368,7 @@ def require_outside(out: Path) -> None:
 
 
 def require_beside(folder: Path) -> None:
-    """Raise unless a folder that nobody named, beside a store, may be written.
+    """Raise unless a folder beside a store, which the user did not name, may be written.
 
     StoreError if it is a link, which anybody may have put there; ConfigError as `require_outside`.
     """
@@ -378,9 +378,9 @@ def require_beside(folder: Path) -> None:
 
 
 def _root_document(path: Place) -> dict[str, Any]:
-    """Return the root's ``zarr.json``, empty where it is not a store's.
+    """Return the root's ``zarr.json``, or an empty dict if it is not that of a store.
 
-    StoreError if there is nothing at all, or it cannot be read.
+    StoreError if the file does not exist or cannot be read.
     """
     file = path / "zarr.json"
     try:

@@ -1,8 +1,7 @@
-"""The records of an asset and of a build: what was made from what, by what, and how well.
+"""Records of an asset and of a build: sources, parameters, versions and quality.
 
-They are written and read by `slatprep.store.record_json`, and nowhere
-else. A record that is read is checked: unknown keys, types, ranges and
-digests. ``slatprep/store/schema`` holds the JSON Schemas, which
+Only `slatprep.store.record_json` writes and reads them. It checks the keys, types, ranges and
+digests of a record that it reads. ``slatprep/store/schema`` holds the JSON Schemas, which
 ``tools/schema.py`` makes from these classes.
 """
 
@@ -35,7 +34,7 @@ from slatprep.records import (
 RECORD_VERSION: Final = 1
 
 MAX_SOURCES = MAX_WARNINGS = 256
-"""Files of one asset: several for each of its annotations, of which there are seldom many."""
+"""Largest number of an asset's files, and of its warnings; each annotation has several files."""
 
 _CHECKED: dict[str, object] = {
     "extra": "forbid",
@@ -66,14 +65,14 @@ Seconds = Annotated[float, Ge(0)]
 
 @dataclass(frozen=True)
 class StageParameters:
-    """The parameters that decide an asset's row, without where its files lie."""
+    """The parameters that decide an asset's row, without the places of its files."""
 
     align: AlignParameters
     sample: SampleParameters
 
 
 PropertyCounts = Annotated[dict[PropertyName, Count], MaxLen(MAX_PROPERTIES)]
-"""How many values, by property."""
+"""Number of values of each property, by its name."""
 
 
 @dataclass(frozen=True)
@@ -83,22 +82,22 @@ class VoxelCounts:
     occupied: Count
     """Occupied PixieVerse voxels."""
     annotated: Count
-    """Those with a class and properties that a material can have."""
+    """Occupied voxels with a class, and properties that a material can have."""
     unannotated: Count
-    """The others."""
+    """Occupied voxels that are not annotated."""
     boundary: Count
-    """Those that touch an empty voxel by a face."""
+    """Occupied voxels that touch an empty voxel by a face."""
     slat_voxels: Count
     """SLAT voxels."""
     valid: Count
     """SLAT voxels with an annotation near enough."""
     unphysical: Count = 0
-    """Of the unannotated those with a class, but properties that no material has."""
+    """Unannotated voxels with a class, but properties that no material has."""
 
 
 @dataclass(frozen=True, eq=False)
 class FirstPass:
-    """What was found for an asset alone, before the passes over the whole dataset."""
+    """Result for an asset by itself, before the passes over the whole dataset."""
 
     key: Digest
     alignment: Alignment
@@ -107,7 +106,7 @@ class FirstPass:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AssetRecord:
-    """What one row of a store was made from, by what, and how well.
+    """Sources, parameters, versions and quality of one row of a store.
 
     Lengths are in voxels, angles in degrees, times in seconds.
     """
@@ -121,9 +120,9 @@ class AssetRecord:
     object_id: str
     """PixieVerse id of the object."""
     view: str
-    """Image or seed the SLAT was made from; empty where there is one only."""
+    """Image or seed the SLAT was made from; empty if there is only one."""
     category: str
-    """PixieVerse category; empty where unknown."""
+    """PixieVerse category; empty if unknown."""
     status: Literal[Status.OK]
     """The asset is in the store."""
     sources: Annotated[tuple[SourceFile, ...], MinLen(2), MaxLen(MAX_SOURCES)]
@@ -137,23 +136,23 @@ class AssetRecord:
     code: Digest
     """Fingerprint of the code that made the numbers."""
     key: Digest
-    """What decides this row, as one hash: sources, parameters, libraries and code."""
+    """Hash of what decides this row: sources, parameters, libraries and code."""
     alignment: Alignment
     """The transform, how it was found, and how well it fits."""
     judgement: Judgement
-    """What ties would change in the labels, the verdict and its reasons."""
+    """The ambiguity, which is what ties would change in the labels; the verdict and its reasons."""
     first_pass: FirstPass | None = None
-    """What was found for the asset alone, where a pass over the whole dataset changed that."""
+    """Result for the asset by itself, if a pass over the whole dataset changed it."""
     counts: VoxelCounts
     """Voxels of the asset."""
     merged: Annotated[tuple[Contribution, ...], MaxLen(MAX_SOURCES)] = ()
-    """Of several annotations of the object each; what else is here is of the first of those that
-    are merged, but for the judgement's expected accuracy and the valid voxels. Left out of the
-    text where there is one annotation."""
+    """One entry for each annotation of the object, if there are several; left out of the text if
+    there is one. The record's other entries describe the first merged annotation, except for the
+    judgement's expected accuracy and the valid voxels."""
     latents: LatentMoments | None = None
-    """Mean and standard deviation of each channel of its latents, as they lie in the file."""
+    """Mean and standard deviation of each channel of its latents, as the file holds them."""
     warnings: Annotated[tuple[str, ...], MaxLen(MAX_WARNINGS)]
-    """What a person should know about the sources."""
+    """Remarks about the sources that a person should know."""
 
     def of_first_pass(self) -> AssetRecord:
         """Return the record as it was before the passes over the whole dataset."""
@@ -186,15 +185,15 @@ class FailedRecord:
     object_id: str
     """PixieVerse id of the object."""
     view: str
-    """Image or seed the SLAT was made from; empty where there is one only."""
+    """Image or seed the SLAT was made from; empty if there is only one."""
     category: str
-    """PixieVerse category; empty where unknown."""
+    """PixieVerse category; empty if unknown."""
     status: StatusOfFailed
-    """``skipped`` where a partner is missing, ``failed`` otherwise."""
+    """``skipped`` if a partner is missing, ``failed`` otherwise."""
     reason: Annotated[str, MinLen(1)]
-    """Why the asset did not go in, in one line."""
+    """Why the asset is not in the store, in one line."""
     traceback: str = ""
-    """Where an error of slatprep's own arose; empty otherwise."""
+    """Traceback of an internal error of slatprep; empty otherwise."""
     parameters: StageParameters
     """The parameters of the build."""
     versions: Versions
@@ -223,14 +222,14 @@ class BuildCounts:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BuildRecord:
-    """One build of a store, over its asset records."""
+    """One build of a store as a whole; each asset has a record of its own."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
 
     format: Literal["slatprep-build-record"] = "slatprep-build-record"
     format_version: Literal[1] = RECORD_VERSION
     id: Digest
-    """SHA-256 of what decides the store, the asset records among it; its attribute ``manifest``."""
+    """SHA-256 of what decides the store, asset records included; its attribute ``manifest``."""
     name: str
     """Name of the dataset."""
     created: datetime
@@ -242,9 +241,9 @@ class BuildRecord:
     store: str
     """Name of the store's directory."""
     records: str
-    """Name of the file of asset records, beside this one; of several with a ``*``."""
+    """Name of the file of asset records beside this file; with a ``*`` if there are several."""
     parameters: BuildParameters
-    """All parameters, with where the sources lay."""
+    """All parameters, with the places of the sources."""
     versions: Versions
     """Versions of slatprep and of its libraries."""
     normalization: Normalization
@@ -256,4 +255,4 @@ class BuildRecord:
     counts: BuildCounts
     """Voxels of the store."""
     failed: tuple[FailedRecord, ...] = ()
-    """The assets that could not go in, by id; the first of them where they are very many."""
+    """The assets that could not go in, by id; only the first of them if they are very many."""

@@ -1,6 +1,6 @@
-"""Records as JSON, written and read with bounds, and as columns, in this one place.
+"""Write and read records as JSON, within bounds, and turn them into columns; nothing else does.
 
-Their JSON Schemas lie in `FOLDER`, where they are published; ``tools/schema.py`` writes them.
+`FOLDER` holds their published JSON Schemas, which ``tools/schema.py`` writes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _Kind = TypeVar("_Kind")
 
 
 class RecordError(StoreError):
-    """A record that cannot be read: where it lies, and its faults, each with place and value."""
+    """A record that cannot be read; each fault is told with its place and value."""
 
     def __init__(self, where: str, faults: tuple[str, ...]) -> None:
         super().__init__(
@@ -46,7 +46,7 @@ def to_json(record: Record | BuildRecord, *, indent: bool = False) -> bytes:
     option = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if indent else 0)
     written: object = record
     if isinstance(record, AssetRecord) and not record.merged:
-        # What there is of merged annotations alone is not written of others.
+        # Only merged annotations have these entries.
         files = [_without(file, "source") for file in record.sources]
         written = {**_without(record, "merged"), "sources": files}
     return orjson.dumps(written, default=_plain, option=option)
@@ -57,9 +57,9 @@ def _without(entry: AssetRecord | SourceFile, name: str) -> dict[str, object]:
 
 
 def read_record(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
-    """Read the record of a row or of a build, which errors call `where`.
+    """Read the record of a row or of a build; errors call it `where`.
 
-    RecordError if it is none of this version, or breaks its schema.
+    RecordError if it has another version or breaks its schema.
     """
     from pydantic import ValidationError
 
@@ -74,9 +74,9 @@ def read_record(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
 
 
 def faults_of(record: AssetRecord) -> tuple[str, ...]:
-    """Return why nobody could read a record back, before it is written; nothing where one can.
+    """Return the faults for which a record could not be read back; none if it can be.
 
-    It may grow to twice its size, by what was found before a pass over the whole dataset.
+    A pass over the whole dataset may double the record's size by its `first_pass`.
     """
     text = to_json(record)
     if len(text) > MAX_RECORD_BYTES // 2:
@@ -91,25 +91,25 @@ def faults_of(record: AssetRecord) -> tuple[str, ...]:
 def build_id_of(head: object, digests: Iterable[tuple[str, bytes]]) -> str:
     """Return the id of a build: SHA-256, in hex, of what decides its store.
 
-    That is `head`, and `digest_of` each record by asset id, whatever the order of the rows.
+    `digests` are asset ids with `digest_of` their records, in any order; `head` is the rest.
     """
     first = orjson.dumps(head, option=orjson.OPT_SORT_KEYS)
     return hashlib.sha256(first + b"".join(digest for _, digest in sorted(digests))).hexdigest()
 
 
 def digest_of(text: bytes) -> bytes:
-    """Return the SHA-256 of a record's text, by which builds and stores tell it from others."""
+    """Return the SHA-256 of a record's text, by which builds and stores identify it."""
     return hashlib.sha256(text).digest()
 
 
 def faults_in(error: ValidationError) -> Iterator[tuple[str, str, str]]:
-    """Yield where each fault is, what should be there, and what is; empty where it is missing."""
-    # A stranger's document may have any number.
+    """Yield place, message and value of each fault; the value is empty if it is missing."""
+    # A stranger's document may have any number of faults.
     found = error.errors(include_url=False)[:_FAULTS]
     for fault in found:
         at = fault["loc"]
         if any(other["loc"][: len(at)] == at != other["loc"] for other in found):
-            continue  # A list that is too short without the faulty item is no fault of its own.
+            continue  # A list that is too short only for its faulty item is no second fault.
         value = "" if fault["type"] == "missing" else repr(fault["input"])[:100]
         yield "/".join(map(str, at)), fault["msg"], value
 
@@ -123,10 +123,10 @@ def _plain(value: object) -> Any:
 
 
 def columns_of(record: AssetRecord) -> dict[str, Any]:
-    """Return an asset's row of each ``asset/*`` array that its record tells, by its last name.
+    """Return an asset's row of each ``asset/*`` array that follows from its record, by last name.
 
     An array of `slatprep.store.layout.ARRAYS` that has the name of an entry takes its value.
-    ``property_ambiguity`` is in mapped units: ranges come from the dataset.
+    ``property_ambiguity`` is in mapped units, because ranges come from the dataset.
     """
     alignment, judgement, counts = record.alignment, record.judgement, record.counts
     parts = (counts, alignment.quality, judgement, alignment, record)

@@ -1,6 +1,6 @@
-"""The records of a store: those that it holds of its rows, and the manifests beside it.
+"""The records of a store: one for each of its rows, and the manifests beside it.
 
-A file of lines is derived from one shard of ``asset/record`` by `lines_of`, and by nothing else.
+Only `lines_of` makes the content of a file of lines, from one shard of ``asset/record``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from slatprep.store.record import AssetRecord, BuildRecord
 from slatprep.store.record_json import read_record
 
 _CHUNKS_KEPT = 8
-"""Chunks of texts in memory, 0.6 MB each."""
+"""Number of chunks of texts kept in memory, 0.6 MB each."""
 
 
 class StoredRecords:
@@ -39,9 +39,9 @@ class StoredRecords:
         return self.read(self.store.match(name))
 
     def place_map(self, asset: StoredAsset) -> PlaceMap:
-        """Return the map between the frames by which an asset was looked up.
+        """Return the map between the frames by which an asset's labels were read.
 
-        StoreError if the asset is deformed, and its record, which holds how, cannot be read.
+        StoreError if the asset is deformed, and the record with its deformation cannot be read.
         """
         if asset.columns["model"] in (Model.RIGID, Model.SIMILARITY):
             return PlaceMap(asset.transform)
@@ -53,9 +53,9 @@ class StoredRecords:
         return read_record(AssetRecord, self.text(row), where)
 
     def text(self, row: int) -> str:
-        """Return the record of a row as its JSON, unchecked; StoreError where it cannot be read."""
+        """Return the record of a row as its JSON, unchecked; StoreError if it cannot be read."""
         chunk, position = divmod(row, RECORDS_IN_CHUNK)
-        # Assets are asked for nearly in order, of each segment.
+        # Callers ask for rows nearly in order, within each segment.
         if chunk not in self._chunks:
             start = chunk * RECORDS_IN_CHUNK
             stop = min(start + RECORDS_IN_CHUNK, len(self.store))
@@ -69,13 +69,13 @@ class StoredRecords:
 BUILD, ASSETS, SEVERAL, ERRORS = "build.json", "assets.jsonl", "assets-*.jsonl", "decoys.json"
 
 MAX_BUILD_BYTES = 32 * 2**20
-"""No `build.json` is larger: it lists as many of the assets that could not go in as fit."""
+"""Largest size of a `build.json`; it lists only as many failed assets as fit."""
 
 _LINES = re.compile(r"assets(-\d{5,})?\.jsonl")
 
 
 def file_names(assets: int) -> list[str]:
-    """Return the names of the files of lines, one for each shard of the records of so many assets.
+    """Return the names of the files of lines: one for each shard of the assets' records.
 
     >>> file_names(5), file_names(1025)
     (['assets.jsonl'], ['assets-00000.jsonl', 'assets-00001.jsonl'])
@@ -92,7 +92,7 @@ def lines_of(store: Store, shard: int) -> bytes:
 
 
 def stale_files(folder: Path, names: Sequence[str]) -> list[Path]:
-    """Return the files of lines in a folder that have none of these names."""
+    """Return the files of lines in a folder whose name is not among `names`."""
     there = (file for file in folder.iterdir() if _LINES.fullmatch(file.name))
     return sorted(file for file in there if file.name not in names)
 
@@ -106,15 +106,15 @@ def build_text(folder: Place) -> bytes:
 
 
 def build_in(folder: Place) -> BuildRecord:
-    """Read the record of a build; StoreError where it cannot be."""
+    """Read the record of a build; StoreError if it cannot be read."""
     return read_record(BuildRecord, build_text(folder), str(folder / BUILD))
 
 
 def manifests_of(store: Place) -> Place:
     """Return the folder of a store's records: ``demo.manifests`` beside ``demo.zarr``.
 
-    Those of a version on an object store lie beside all versions; those of a store behind a link
-    lie beside the store.
+    For a version on an object store it lies beside all versions. For a link to a store it lies
+    beside the store.
     """
     if isinstance(store, Path) and store.is_symlink():
         store = store.resolve()
@@ -124,10 +124,10 @@ def manifests_of(store: Place) -> Place:
 
 
 def found_manifests(store: Place, build: str) -> Place | None:
-    """Return the folder of a store's records, None where there is none.
+    """Return the folder of a store's records, or None if there is none.
 
-    Beside the store, or where `make align` leaves them: the one that is of the store's `build`;
-    else what lies beside it. StoreError if nobody can tell.
+    It is the folder beside the store, or else the one of `make align`, that records the store's
+    `build`; if neither does, the folder beside the store. StoreError if that cannot be reached.
     """
     named = store.parent.parent if is_version(store) else store
     folder = manifests_of(store)

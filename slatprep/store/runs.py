@@ -1,4 +1,4 @@
-"""Which rows of a new array follow one another in an older one, so that bytes can be taken over."""
+"""Find rows of a new array that are adjacent in an older one, so that bytes can be taken over."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from typing import NamedTuple
 
 
 class Run(NamedTuple):
-    """Rows ``start`` to ``stop - 1`` of a new array; an older store has them `shift` rows on."""
+    """Rows ``start`` to ``stop - 1`` of a new array, which lie `shift` rows on in an older store.
+
+    `store` is the number of the older store.
+    """
 
     start: int
     stop: int
@@ -19,14 +22,14 @@ class Run(NamedTuple):
 
 
 Piece = tuple[Run | None, int, int]
-"""Some rows, the first and the end: whole chunks that a run holds, or None and any rows."""
+"""Run, first row and end of some rows: whole chunks that the run holds, or any rows if None."""
 
 
 @dataclass(frozen=True)
 class Runs:
     """The runs of an array of `new` rows, ascending and without overlap.
 
-    `old` are the rows of the array in each older store.
+    `old` has the number of rows of the array in each older store.
     """
 
     runs: tuple[Run, ...] = ()
@@ -34,10 +37,10 @@ class Runs:
     old: tuple[int, ...] = ()
 
     def holds(self, start: int, end: int) -> Run | None:
-        """Return the run of a store whose chunk has the bytes of this one, `start` to ``end - 1``.
+        """Return the run whose store has the chunk of rows `start` to ``end - 1`` in equal bytes.
 
-        Its last rows may lie beyond the arrays: then both must end at the same row. Shards are
-        looked up likewise.
+        If the chunk reaches beyond the new array, both arrays must end at the same row of it.
+        `start` and `end` may be those of a shard too.
         """
         stop = min(end, self.new)
         position = bisect_right(self.runs, start, key=lambda run: run.start) - 1
@@ -49,7 +52,7 @@ class Runs:
         return run if whole or (stop == self.new and stop + run.shift == old) else None
 
     def pieces(self, start: int, stop: int, chunk: int) -> Iterator[Piece]:
-        """Cut the rows of a shard into pieces of whole chunks that a run holds, and others.
+        """Cut the rows of a shard into pieces: whole chunks that a run holds, and other rows.
 
         >>> list(Runs((Run(0, 5, 0, 0),), new=9, old=(5,)).pieces(0, 9, 2))
         [(Run(start=0, stop=5, store=0, shift=0), 0, 4), (None, 4, 9)]
@@ -61,7 +64,7 @@ class Runs:
 
 
 def runs_of(spans: Iterable[Run], new: int, old: tuple[int, ...]) -> Runs:
-    """Return the runs that spans make; those that continue one another become one.
+    """Join spans that continue one another into runs.
 
     >>> runs_of([Run(0, 2, 0, 5), Run(2, 5, 0, 5), Run(7, 9, 0, 5)], 12, (20,)).runs
     (Run(start=0, stop=5, store=0, shift=5), Run(start=7, stop=9, store=0, shift=5))

@@ -1,10 +1,9 @@
-"""Rows of an array, read straight from its shards.
+"""Read rows of an array straight from its shards.
 
 A shard is a file of chunks with an index at its end (Zarr format 3,
-"sharding_indexed" codec): for each chunk where it begins and how long it is,
-as little-endian uint64, then a CRC32C of the index. The chunks of one asset
-lie side by side, so this reader asks the file for them and for nothing else;
-zarr-python reads the same bytes with far more work around them.
+"sharding_indexed" codec): the offset and length of each chunk as
+little-endian uint64, then a CRC32C of the index. The chunks of one asset are
+adjacent, so this reader reads only them; zarr-python reads the same bytes with far more overhead.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ MISSING = 2**64 - 1
 """Offset and length of a chunk that was never written: it holds the fill value."""
 
 OPEN_SHARDS = 32
-"""Shards of one array that stay open at a time."""
+"""Largest number of open shards of one array."""
 
 _COPIED_BYTES = 4 * 2**20
 
 MAX_CHUNK_BYTES = 256 * 2**20
-"""What one chunk may unpack to; a grid's takes 3 MiB."""
+"""Largest size of an unpacked chunk; a chunk of ``grid/*`` takes 3 MiB."""
 
 BAD_METADATA = (
     ArithmeticError,  # A fill value beyond its data type.
@@ -44,14 +43,14 @@ BAD_METADATA = (
     TypeError,
     ValueError,
 )
-"""What Python, numpy and zarr-python raise for metadata that make no sense."""
+"""Errors that Python, numpy and zarr-python raise for invalid metadata."""
 
 MAX_TEXT = {RECORD_ARRAY: MAX_RECORD_BYTES}
-"""What the texts of a chunk may have on average, where that is more than a name may have."""
+"""Largest mean size of the texts of a chunk [byte], by array, if it is more than a name's."""
 
 
 class DamagedFileError(StoreError):
-    """A file of a store, in a folder, that is missing, cut short or damaged."""
+    """A file of the store in `folder` that is missing, cut short or damaged."""
 
     def __init__(self, folder: str, file: str, fault: str, expected: str) -> None:
         super().__init__(
@@ -75,8 +74,8 @@ class _Shard:
 class RowReader:
     """Reads rows of one array of a store; safe to share between threads and across a fork.
 
-    A file has `shard_rows` rows, and an index if it is `sharded`; else it is one chunk. A chunk
-    that was never written holds the `fill_value`.
+    A file has `shard_rows` rows. It has an index if it is `sharded`; otherwise it is one chunk. A
+    chunk that was never written holds the `fill_value`.
     """
 
     folder: Folder
@@ -93,14 +92,14 @@ class RowReader:
         self.dtype = self.decoder.dtype
         self.chunk_rows = self.decoder.shape[0]
         self.chunks_per_shard = self.shard_rows // self.chunk_rows
-        # Zarr leaves out files of fill values alone, as a column of empty strings is.
+        # Zarr writes no file for fill values alone, such as a column of empty strings.
         self.optional = self.name.startswith("asset/") and self.name != "asset/offset"
 
     @classmethod
     def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
         """Return a reader for an array with this ``zarr.json``.
 
-        StoreError if that makes no sense, or the array is not cut and packed as slatprep does it.
+        StoreError if it is invalid, or the array has not the chunks and codecs of slatprep.
         """
         try:
             text = metadata["data_type"] == "string"
@@ -155,10 +154,10 @@ class RowReader:
         return out
 
     def packed(self, first: int, last: int) -> Iterator[tuple[bytes, list[int]]]:
-        """Yield the bytes of chunks ``first`` to ``last - 1`` packed, with their lengths.
+        """Yield the packed bytes of chunks ``first`` to ``last - 1`` and their lengths.
 
-        They come several at a time; the checksum of each holds. StoreError if one is damaged, or
-        they do not lie as slatprep writes them.
+        Each item has several chunks, whose checksums are verified. StoreError if a chunk is
+        damaged, or the chunks of a shard do not follow one another.
         """
         for number, index in self._entries(range(first, last)):
             shard, ends = self._shard(number), index.sum(axis=1)
@@ -175,16 +174,13 @@ class RowReader:
                 yield data, own[:, 1].tolist()
 
     def _entries(self, chunks: range) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Yield each shard's number with offset and length of those of its chunks (K, 2)."""
+        """Yield each shard's number, and offset and length of the given chunks in it (K, 2)."""
         for number, own in groupby(chunks, lambda chunk: chunk // self.chunks_per_shard):
             places = [chunk % self.chunks_per_shard for chunk in own]
             yield number, self._shard(number).index[places].astype(np.int64)
 
     def _ahead(self, chunks: range) -> dict[tuple[int, int], bytes]:
-        """Ask once for the chunks of each shard, which lie side by side, and not once for each.
-
-        They are returned by shard and offset.
-        """
+        """Read each shard's adjacent chunks in one request; return them by shard and offset."""
         held = {}
         for number, index in self._entries(chunks):
             there, file = index[index[:, 0] >= 0].tolist(), self._shard(number).file
@@ -218,7 +214,7 @@ class RowReader:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
 
     def _scratch(self) -> NDArray[Any]:
-        """Return memory for a chunk of which only some rows are wanted, one for each thread."""
+        """Return this thread's memory for a chunk of which only some rows are wanted."""
         scratch: NDArray[Any] | None = getattr(self._local, "scratch", None)
         if scratch is None:
             scratch = self._local.scratch = np.empty(self.decoder.shape, self.dtype)
@@ -236,7 +232,7 @@ class RowReader:
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
-        # Two threads may both have opened it; either may be kept.
+        # Two threads may have opened the shard; either result may stay.
         self._shards[number] = shard
         for oldest in list(self._shards)[:-OPEN_SHARDS]:
             self._shards.pop(oldest, None)

@@ -1,8 +1,8 @@
 """Write a shard chunk by chunk, so that a shard may be far larger than memory.
 
-The file is the one that zarr-python writes, byte for byte, given all rows at
+The file has the same bytes as one that zarr-python writes from all rows at
 once: chunks one after the other, then their index (see `slatprep.store.shard_reader`).
-On an object store it is written to the worker's own disk first, in the folder for temporary files.
+For an object store it is written to the worker's own disk first, in the folder for temporary files.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
 
 
 class Written(NamedTuple):
-    """A file as it was written: its bytes, and their SHA-256 in hex."""
+    """Size of a written file [byte], and its SHA-256 in hex."""
 
     size: int
     sha256: str
@@ -36,7 +36,7 @@ class Written(NamedTuple):
 class ShardWriter:
     """Writes the rows of one shard of one array, in order, from row `start` of the array on.
 
-    `file` is the name of the shard's file below the store, in which the array has been created.
+    The store must have the array. `file` is the name of the shard's file below the store.
     """
 
     def __init__(self, store: Place, name: str, start: int) -> None:
@@ -57,7 +57,7 @@ class ShardWriter:
         self._size = 0
 
     def append(self, rows: NDArray[Any]) -> None:
-        """Write the next rows, (K, ...), of a dtype that casts to the array's."""
+        """Write the next rows (K, ...), whose dtype casts to the array's."""
         while len(rows):
             room = len(self._chunk) - self._rows
             taken, rows = rows[:room], rows[room:]
@@ -70,14 +70,14 @@ class ShardWriter:
                 self._flush(self._chunk)
 
     def append_fill(self, rows: int) -> None:
-        """Write so many rows of the array's fill value."""
+        """Write a number of rows of the array's fill value."""
         shape = (rows, *self._chunk.shape[1:])
         self.append(np.full(shape, self._fill_value, self._chunk.dtype))
 
     def append_packed(self, data: bytes, lengths: Iterable[int]) -> None:
-        """Write the next chunks, packed, as `RowReader.packed` gives them.
+        """Write the next chunks, already packed, as `RowReader.packed` yields them.
 
-        ValueError if the rows before them do not end with a chunk.
+        ValueError if the rows before them do not fill whole chunks.
         """
         if self._rows:
             raise ValueError(f"{self._rows} rows of a chunk are waiting; expected none")
@@ -87,14 +87,14 @@ class ShardWriter:
             self._chunks, self._bytes = self._chunks + 1, self._bytes + length
 
     def finish(self) -> None:
-        """Write the last chunk, filled up, and the index; on exit the shard gets its name."""
+        """Write the last chunk, padded, and the index; on exit the file gets its name."""
         if self._rows:
             self._chunk[self._rows :] = self._fill_value
             self._flush(self._chunk)
         self._write(_with_checksum(self._index.tobytes()))
 
     def written(self) -> Written:
-        """Return what the file holds, after exit."""
+        """Return the size and digest of the file, after exit."""
         return Written(self._size, self._digest.hexdigest())
 
     def __enter__(self) -> ShardWriter:
@@ -119,14 +119,14 @@ class ShardWriter:
 
 @contextmanager
 def _staged(store: Place, file: str) -> Iterator[Path]:
-    """Yield a file of the local disk that becomes one of a store, whole, when all went well."""
+    """Yield a local file that becomes a store's file in one step, unless an error is raised."""
     folder = storage_of(store).local
     if folder is None:
         with writing(file, store), storage_of(store / file).staged() as partial:
             yield partial
         return
     (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    # Beside the store, where what a killed worker leaves is no part of it.
+    # Beside the store, so that leftovers of a killed worker are no part of it.
     partials = folder.with_name(f"{folder.name}.partial")
     partials.mkdir(exist_ok=True)
     with staged_apart(folder / file, partials) as partial:
@@ -134,7 +134,7 @@ def _staged(store: Place, file: str) -> Iterator[Path]:
 
 
 def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]:
-    """Return what packs a chunk as the codecs of a ``zarr.json`` say."""
+    """Return a function that packs a chunk by the codecs of a ``zarr.json``."""
     from numcodecs import Blosc, VLenUTF8, Zstd
 
     first, packer, _ = codecs  # `create_store` gives every array these two and a checksum.
@@ -148,7 +148,7 @@ def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]
     blosc = Blosc(
         settings["cname"], settings["clevel"], _SHUFFLES[settings["shuffle"]], settings["blocksize"]
     )
-    # Blosc shuffles by the size of an item; that of a row of three bytes is three.
+    # Blosc shuffles by the item size, which is three for rows of three bytes.
     item = np.dtype(f"V{settings['typesize']}")
     return lambda chunk: _with_checksum(blosc.encode(chunk.reshape(-1).view(item)))
 

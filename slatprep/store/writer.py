@@ -1,8 +1,8 @@
-"""Write the store: one task a shard, each shard by exactly one task.
+"""Write the store: each shard by exactly one task.
 
 Two writers of one shard lose data, because a shard is rewritten as a whole.
-So `shards` cuts the store into tasks that share none, which
-`slatprep.pipeline.pack` runs; small arrays are written by the parent.
+So `shards` cuts the store into tasks that share no shard, and
+`slatprep.pipeline.pack` runs them. The parent writes the small arrays.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from slatprep.store.integrity import add_array, open_for_writing, write_digests
 from slatprep.store.runs import Piece, Runs
 
 GROUPS = ("voxel", "grid", "record")
-"""What is cut into shards: arrays below ``voxel`` and ``grid``, and the records."""
+"""Groups that are cut into shards: arrays below ``voxel`` and ``grid``, and the records."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,11 @@ class Shard:
     first : int
         Index of the first asset that has rows in it.
     rows : sequence
-        Where the arrays of the assets lie that have rows in it, in a form that the writer knows.
+        For each asset with rows in the shard, where its arrays lie, in a form the writer knows.
     offsets : sequence of int
-        First row of each of them in the store, and the last one's end.
+        First row of each of these assets in the store, and the end of the last one.
     pieces : sequence of Piece
-        Its rows, and which of them an older store has in whole chunks.
+        The rows of the shard, with the runs of whole chunks that older stores have.
     """
 
     group: str
@@ -66,10 +66,10 @@ def create_store(
     contents: Contents = PIXIEVERSE,
     merged: bool = False,
 ) -> None:
-    """Create a store at a new path with every array in place, empty.
+    """Create a store at a new path, with all arrays, still empty.
 
-    It has `n_assets` rows, `n_voxels` voxels, and the arrays of `merged` labels if there are any;
-    `contents` says how many properties and channels there are.
+    It has `n_assets` rows and `n_voxels` voxels; `contents` gives its properties and channels.
+    `merged` adds the arrays of merged labels.
     """
     import zarr
 
@@ -118,7 +118,7 @@ def _codecs(array: layout.ArrayLayout, level: int) -> dict[str, Any]:
 
 
 def packing_of(array: Place) -> object:
-    """Return how an array is cut into chunks, and how those are packed."""
+    """Return how an array's chunks are cut and packed: type, fill value, shape and codecs."""
     document = read_metadata(array / "zarr.json")
     names = ("data_type", "fill_value", "codecs")
     data_type, fill_value, codecs = (document.get(name) for name in names)
@@ -127,7 +127,7 @@ def packing_of(array: Place) -> object:
 
 
 def cuts_of(parameters: StoreParameters, n_voxels: int) -> dict[str, tuple[int, int]]:
-    """Return how many rows one chunk, and one shard, of each group holds."""
+    """Return the number of rows of a chunk and of a shard, by group."""
     return {
         "voxel": (parameters.voxel_chunk, layout.rows_per_shard(parameters, n_voxels)),
         "grid": (1, parameters.grid_assets_per_shard),
@@ -142,10 +142,10 @@ def shards(
     runs: Mapping[str, Runs] = MappingProxyType({}),
     taken: Container[tuple[str, int]] = (),
 ) -> Iterator[Shard]:
-    """Yield the shards of a store whose assets begin at rows `offsets`, but those that are taken.
+    """Yield the shards of a store whose assets begin at rows `offsets`.
 
-    `rows` say where the arrays of each asset lie, `runs` by group which rows older stores have in
-    chunks of the same bytes, and `taken` which shards, by group and number, are left out.
+    `rows` say where the arrays of each asset lie. `runs` are, by group, the rows that older stores
+    have in chunks of the same bytes. `taken` has the group and number of each shard to leave out.
     """
     for group, (chunk, per_shard) in cuts_of(parameters, offsets[-1]).items():
         own, edges = runs.get(group, Runs()), layout.edges_of(group, offsets)
@@ -168,10 +168,10 @@ def finish_store(
     known: Mapping[str, str] = MappingProxyType({}),
     elsewhere: Mapping[str, int] = MappingProxyType({}),
 ) -> None:
-    """Write the root's attributes and all files' digests; gather all metadata in one file.
+    """Write the root's attributes and all files' digests, then consolidate the metadata.
 
-    `build` are parameters and versions that made the content, `known` digests of files as they were
-    written or have been seen to be true, `elsewhere` bytes of files that are not at `path`.
+    `build` has the parameters and versions that made the content. `known` has digests of files
+    that were computed on writing or verified, `elsewhere` sizes [byte] of files not at `path`.
     """
     import zarr
 
@@ -182,7 +182,7 @@ def finish_store(
     _write_coordinates(root, [one.name for one in contents.properties])
     write_digests(path, known, elsewhere)
     with warnings.catch_warnings():
-        # Zarr says that consolidated metadata are not in format 3's text yet.
+        # Zarr warns that the specification of format 3 has no consolidated metadata yet.
         # They only save reads: a reader that ignores them finds every array.
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
         zarr.consolidate_metadata(str(path), zarr_format=3)
@@ -191,9 +191,9 @@ def finish_store(
 def _write_coordinates(root: Any, properties: Sequence[str]) -> None:
     """Write coordinates of dimensions, so that xarray can name rows, columns and places.
 
-    An array that is named as its dimension becomes an index in xarray: after
-    ``xarray.open_zarr(store, group="voxel")`` one may write ``.sel(property="density")``. Zarr
-    itself gives such an array no meaning.
+    xarray makes an array with its dimension's name an index:
+    ``xarray.open_zarr(store, group="voxel").sel(property="density")`` works. For Zarr itself the
+    array has no meaning.
     """
     centres = voxel_centres(np.repeat(np.arange(RESOLUTION)[:, None], 3, axis=1))[:, 0]
     texts = {"property": properties, "axis": list("xyz")}
@@ -202,5 +202,5 @@ def _write_coordinates(root: Any, properties: Sequence[str]) -> None:
             values = np.array(texts[dimension], object) if dimension in texts else centres
             description = f"coordinate of the dimension {dimension}"
             add_array(root[group], dimension, values, dimension, description)
-    # The arrays that name the rows of ``asset``; the attribute is CF's.
+    # This CF attribute names the arrays that label the rows of ``asset``.
     root["asset"].attrs["coordinates"] = "id object_id view category"

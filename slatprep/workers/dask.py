@@ -34,13 +34,13 @@ with needing("a cluster needs", "cluster"):
 Result = TypeVar("Result")
 
 ANSWER_SECONDS = 15.0
-"""Seconds for a scheduler to answer, of which a third to connect."""
+"""Longest time [s] for a scheduler to answer; a third of it is the limit for connecting."""
 
 BATCHES_A_CORE = 3
-"""Batches per core of a cluster: one under way, and others that wait."""
+"""Number of batches per core of a cluster: one runs, the others wait."""
 
 BATCHES_A_SECOND = 200.0
-"""Batches per second for a scheduler, which could hand out some 500."""
+"""Largest number of batches per second; a scheduler could hand out some 500."""
 
 SHORTEST_BATCH_SECONDS = 0.25
 
@@ -53,9 +53,9 @@ _LIBRARIES = (
 class Cluster:
     """The workers of a Dask cluster, in place of a number of jobs.
 
-    `scheduler` is its address, such as ``tcp://host:8786``. `note` gets a line for the user while a
-    first worker is awaited and when it is there. On entering, SlatprepError if no scheduler
-    answers, or a worker is not fit.
+    `scheduler` is its address, such as ``tcp://host:8786``. `note` gets a line for the user if no
+    worker is there yet, and one when the workers are ready. On entry, SlatprepError is raised if no
+    scheduler answers or a worker is not fit.
 
     >>> with Cluster("tcp://host:8786") as cluster:  # doctest: +SKIP
     ...     build_store(parameters, out, jobs=cluster)
@@ -71,7 +71,7 @@ class Cluster:
         for name in ("distributed.client", "tornado.application"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
-            with ThreadPoolExecutor(1) as thread:  # in a notebook, this one has a loop already
+            with ThreadPoolExecutor(1) as thread:  # A notebook's thread already runs a loop.
                 thread.submit(asyncio.run, _reach(self.scheduler)).result()
             self._client = distributed.Client(
                 self.scheduler, timeout=ANSWER_SECONDS, set_as_default=False
@@ -109,7 +109,7 @@ class Cluster:
     def require_shared(self, paths: Iterable[Place]) -> None:
         """Raise `SlatprepError` unless every worker sees the same files and folders as we do.
 
-        Workers that join later are checked before their first task, until the next call.
+        A worker that joins later is checked before its first task. The next call replaces `paths`.
         """
         files = {}
         for path in paths:
@@ -124,11 +124,11 @@ class Cluster:
             self._check_workers()
 
     def _check_workers(self) -> int:
-        """Wait for a worker, without limit; return their number, or raise unless all are fit."""
+        """Wait for a first worker without limit; return their number, or raise if one is unfit."""
         found: dict[str, Exception | None] = {}
         while not found:
             if not self._client.ncores():
-                # No limit: a batch system's queue may take hours.
+                # There is no time limit, because a batch system's queue may take hours.
                 self._note(f"{self.scheduler}: has no worker yet; waiting for the first")
                 self._client.wait_for_workers(1)
             answers = self._client.run(_check, self._common, on_error="return")
@@ -151,7 +151,7 @@ class Cluster:
             yield
         except (OSError, CancelledError) as error:
             if isinstance(error, OSError) and self._client.status == "running":
-                raise  # it is a task's own
+                raise  # A task raised it.
             raise SlatprepError(
                 f"{self.scheduler}: the connection to the scheduler was lost; what was finished "
                 "is kept, so run the same again when it is back"
@@ -160,9 +160,9 @@ class Cluster:
 
 @dataclass(frozen=True)
 class _Common:
-    """What a worker must have in common with this process.
+    """Software and files that a worker must share with this process.
 
-    `software` has names and versions of what computes, `files` paths and what `_look` says of each.
+    `software` has the name and version of each library, `files` each path and its `_look`.
     """
 
     software: tuple[tuple[str, str], ...]
@@ -170,9 +170,9 @@ class _Common:
 
 
 async def _reach(scheduler: str) -> None:
-    """Connect once and leave; a Dask client waits for ever where something else answers.
+    """Connect once and disconnect; a Dask client waits forever if no scheduler answers.
 
-    OSError or ValueError if nothing answers in time, or the address is none.
+    OSError or ValueError if nothing answers in time, or the address is invalid.
     """
     arguments = distributed.Security().get_connection_args("client")
     try:
@@ -184,7 +184,7 @@ async def _reach(scheduler: str) -> None:
 
 
 class _Pool(Pool):
-    """The workers that a cluster has now, for `slatprep.workers.local`."""
+    """The workers that a cluster has now, as a pool."""
 
     killed = distributed.KilledWorker
 
@@ -196,15 +196,15 @@ class _Pool(Pool):
         self._asked = -1.0
 
     def room(self) -> int:
-        """Return more calls than the workers can make at once, and a few without workers."""
+        """Return several calls per core; a few if there is no worker."""
         return BATCHES_A_CORE * max(self._known_cores(), 1)
 
     def batch_seconds(self) -> float:
-        """Return the batch time [s] that the scheduler keeps up with if all workers are busy."""
+        """Return the time per batch [s] at which the scheduler can keep all workers busy."""
         return max(SHORTEST_BATCH_SECONDS, self._known_cores() / BATCHES_A_SECOND)
 
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
-        """Have a worker make a call."""
+        """Hand a call to a worker."""
         future: Future[Any] = self._executor.submit(_do, self._common, call)
         return future
 
@@ -214,7 +214,7 @@ class _Pool(Pool):
             raise ConnectionError("the connection to the scheduler was lost")
 
     def abandon(self, calls: Iterable[Future[Any]]) -> None:
-        """Have the scheduler drop calls that no worker has begun."""
+        """Tell the scheduler to drop calls that no worker has begun."""
         if self._client.status == "running":
             self._executor.shutdown(wait=False)
 
@@ -228,7 +228,7 @@ class _Pool(Pool):
 
 
 def _do(common: _Common, call: Callable[[], Result]) -> Result:
-    """Make a call, on a worker."""
+    """Make a call on this worker, if the worker is fit."""
     _agree(common, distributed.get_worker())
     with single_threaded():
         return call()
@@ -240,7 +240,7 @@ def _check(common: _Common, dask_worker: Any) -> None:
 
 @lru_cache(maxsize=8)
 def _agree(common: _Common, worker: Any) -> None:
-    """Raise unless this worker is fit; asked once per process, because errors are not cached."""
+    """Raise unless this worker is fit; the cache keeps success for the process, but no error."""
     name = f"worker {worker.address} on {platform.node()}"
     if worker.state.nthreads != 1:
         raise SlatprepError(
@@ -265,7 +265,7 @@ def _agree(common: _Common, worker: Any) -> None:
 
 @lru_cache(maxsize=1)
 def _software() -> tuple[tuple[str, str], ...]:
-    """Return what decides the bytes of a store: Python, all of slatprep's code, the libraries."""
+    """Return the versions that decide a store's bytes: Python, slatprep's code, libraries."""
     package = Path(__file__).parents[1]
     code = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
@@ -280,7 +280,7 @@ def _software() -> tuple[tuple[str, str], ...]:
 
 
 def _look(place: Place) -> str:
-    """Return the state of a file or folder that workers must agree on."""
+    """Describe a file or folder in words that must be equal on all workers."""
     storage = storage_of(place)
     try:
         if storage.local is None or stat.S_ISREG(storage.local.stat().st_mode):

@@ -1,6 +1,7 @@
-"""One function over many tasks: on one core, several, or a cluster, one thread each.
+"""Run one function over many tasks, on one core, several cores or a cluster.
 
-A pool of workers is given tasks in batches; those of a killed worker run again, alone.
+Each worker computes on one thread, and gets its tasks in batches. The tasks of a killed worker run
+again, one at a time.
 """
 
 from __future__ import annotations
@@ -35,18 +36,18 @@ THREAD_VARIABLES = (
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMBA_NUM_THREADS",
 )  # fmt: skip
-"""Environment variables that the numeric libraries read once, when loaded."""
+"""Environment variables for the number of threads, which numeric libraries read when they load."""
 
 LARGEST_BATCH = 1000
-"""Most tasks in a batch, however short they are."""
+"""Largest number of tasks in a batch, however short they are."""
 
 _BATCH_SECONDS = 0.2
-"""Seconds per batch: a call's hand-over takes 1 ms, 2 % of an asset; progress looks steady."""
+"""Time per batch [s]; handing over a call takes 1 ms, 2 % of an asset, and progress is steady."""
 
 _POLL_SECONDS = 1.0
 
 _IDLE_SECONDS = 300
-"""Seconds that a worker process stays without work: longer than any pause of a build."""
+"""Time [s] after which an idle worker process ends, longer than any pause of a build."""
 
 
 class Workers(Protocol):
@@ -65,7 +66,7 @@ class Workers(Protocol):
 
 
 Jobs = int | Workers
-"""A number of worker processes of this machine, or other workers."""
+"""Number of worker processes of this machine, or other workers."""
 
 
 def run_unordered(
@@ -78,8 +79,8 @@ def run_unordered(
 
     Tasks are taken from the iterable only as workers become free; each worker computes on one
     thread. After a worker is killed, the tasks under way run again at the end, one at a time. If a
-    task kills its worker even alone, ``died(*task)`` gives its result, or else SlatprepError.
-    Workers must be able to import `function`; with 1 job it runs in this process.
+    task then kills its worker again, ``died(*task)`` gives its result; without `died`, it is a
+    SlatprepError. Workers must be able to import `function`; with 1 job it runs in this process.
     """
     if not isinstance(jobs, int):
         yield from jobs.run_unordered(function, tasks, died)
@@ -93,9 +94,9 @@ def run_unordered(
 
 
 def start_early(function: Callable[..., Any], jobs: Jobs) -> None:
-    """Start the worker processes that `run_unordered` will need, and let them import, meanwhile.
+    """Start the processes that `run_unordered` will use, so that they import `function` early.
 
-    Nothing happens where it will start no processes.
+    Nothing happens if it will use none.
     """
     if isinstance(jobs, int) and jobs > 1:
         processes = _Processes(jobs)
@@ -104,15 +105,15 @@ def start_early(function: Callable[..., Any], jobs: Jobs) -> None:
 
 
 def _imported(function: Callable[..., Any]) -> None:
-    """Keep the imports made for the function out of garbage collection."""
-    # Without psutil loky collects garbage every second, and looks through all modules for it.
+    """Keep the modules that the function imported out of garbage collection."""
+    # Without psutil, loky collects garbage every second, which scans all modules.
     gc.freeze()
 
 
 def run_in_order(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], jobs: Jobs = 1
 ) -> Iterator[Result]:
-    """Yield the results of `run_unordered` in the order of the tasks, which keeps sums the same."""
+    """Yield the results of `run_unordered` in the order of the tasks, so that sums are the same."""
     numbered = ((number, function, task) for number, task in enumerate(tasks))
     early: dict[int, Result] = {}
     following = 0
@@ -136,7 +137,7 @@ def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
 
 
 def at_most(most: int, jobs: Jobs) -> Jobs:
-    """Return fewer processes where there is less work, and at least one."""
+    """Limit a number of processes to `most`, but to at least one; leave other workers alone."""
     return max(1, min(jobs, most)) if isinstance(jobs, int) else jobs
 
 
@@ -144,7 +145,7 @@ class Pool(ABC):
     """Workers that take calls, as a `concurrent.futures.Executor` does."""
 
     killed: type[BaseException]
-    """Errors of a call whose worker was killed."""
+    """Type of the error of a call whose worker was killed."""
 
     @abstractmethod
     def room(self) -> int:
@@ -152,22 +153,22 @@ class Pool(ABC):
 
     @abstractmethod
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
-        """Have a worker make a call."""
+        """Hand a call to a worker."""
 
     @abstractmethod
     def abandon(self, calls: Iterable[Future[Any]]) -> None:
-        """Drop the given calls, which are all that are under way."""
+        """Drop the given calls, which are all calls under way."""
 
     def batch_seconds(self) -> float:
-        """Return how long a batch should take [s]; 0 for one task a batch."""
+        """Return how long a batch should take [s]; 0 means one task per batch."""
         return _BATCH_SECONDS
 
     def check(self) -> None:  # noqa: B027 -- nothing to ask where lost calls raise by themselves
-        """Raise if no answer can come any more; asked every second without an answer."""
+        """Raise if no answer can come any more; called every second while none comes."""
 
 
 class _Processes(Pool):
-    """Processes of this machine, kept for the next call."""
+    """Processes of this machine, which stay for the next call."""
 
     def __init__(self, number: int) -> None:
         from joblib.externals.loky.process_executor import BrokenProcessPool
@@ -176,11 +177,11 @@ class _Processes(Pool):
         self._number = number
 
     def room(self) -> int:
-        """Return a call for each process, and one more for each to begin with next."""
+        """Return two calls per process: one that runs, and one that waits."""
         return 2 * self._number
 
     def submit(self, call: Callable[[], Any]) -> Future[Any]:
-        """Have a process make a call; new processes replace killed ones."""
+        """Hand a call to a process; new processes replace killed ones."""
         while True:
             try:
                 future: Future[Any] = self._executor().submit(call)
@@ -189,8 +190,8 @@ class _Processes(Pool):
                 continue
 
     def abandon(self, calls: Iterable[Future[Any]]) -> None:
-        """End the processes: after an early stop they must not write any more."""
-        # Loky's own thread fails on calls that it has not yet passed on to the processes.
+        """End the processes, because they must not write after an early stop."""
+        # Loky's thread fails on calls that it has not passed to the processes yet.
         while not all(call.running() or call.done() for call in calls):
             time.sleep(0.001)
         self._executor().shutdown(kill_workers=True)
@@ -208,7 +209,7 @@ class _Processes(Pool):
 
 
 def _end_with(parent: int) -> None:
-    """End this worker soon after its parent, however that ends."""
+    """Make this worker end soon after its parent, however the parent ends."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -225,10 +226,10 @@ def run_in_pools(
     tasks: Iterable[Task],
     died: Callable[..., Result] | None,
 ) -> Iterator[Result]:
-    """Run tasks as `run_unordered` does, those of killed workers in `alone`.
+    """Run tasks in `pool` as `run_unordered` does, and tasks of killed workers in `alone`.
 
-    A killed worker takes down, or makes suspect, all calls that waited beside it. All of them run
-    again at the end, one at a time.
+    A killed worker makes all calls beside it fail, and any of their tasks may have killed it. All
+    these tasks run again at the end, one at a time.
     """
     suspects: list[Task] = []
     yield from _attempt(pool, function, tasks, suspects)
@@ -265,7 +266,7 @@ def _attempt(
                 future = pool.submit(partial(_do_batch, function, batch, seconds))
                 under_way[future] = batch
                 future.add_done_callback(finished.put)
-            yield from results  # workers have their next batches while the caller is busy
+            yield from results  # Workers already have their next batches while the caller is busy.
             if not under_way:
                 return
             future = _next(finished, pool)
@@ -280,13 +281,13 @@ def _attempt(
                 in_time = len(results) * seconds / max(spent, 1e-9)
                 size = int(min(max(in_time, 1), LARGEST_BATCH))
     except GeneratorExit:
-        # With nothing under way the caller has taken all results, by `next` or in a `zip`.
+        # If nothing is under way, the caller has taken all results, by `next` or in a `zip`.
         if under_way:
             pool.abandon(under_way)
         raise
     except BaseException:
-        # Even with no known call under way: a signal may have come while a call was
-        # handed over, and its worker would write on beside what the caller cleans up.
+        # This is done even if no call is known. A signal may arrive while a call is handed over,
+        # and its worker would go on writing while the caller cleans up.
         pool.abandon(under_way)
         raise
 
@@ -302,11 +303,11 @@ def _next(finished: SimpleQueue[Future[Any]], pool: Pool) -> Future[Any]:
 def _do_batch(
     function: Callable[..., Result], tasks: list[Task], seconds: float
 ) -> tuple[list[Result], float]:
-    """Return the results of the first task and of those that follow in time, and the time taken.
+    """Do tasks, at least one, until `seconds` have passed; return results and the time taken [s].
 
-    The rest is handed out again, so that no task waits long behind a slow one. A task that raises
-    is handed out again, too, unless it is the first. Its error then arrives after the results of
-    those before it.
+    The other tasks are handed out again, so that no task waits long behind a slow one. A task that
+    raises is handed out again too, unless it is the first. Its error then arrives after the results
+    of the tasks before it.
     """
     begin = time.perf_counter()
     results: list[Result] = []
@@ -324,7 +325,7 @@ def _do_batch(
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Hold the numeric libraries to one thread each, whether loaded before or within."""
+    """Limit each numeric library to one thread, whether it is loaded already or within."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
@@ -340,7 +341,7 @@ def single_threaded() -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _thread_pools(modules: int) -> ThreadpoolController:
-    """Find the loaded libraries in 1 to 4 ms; search again after further imports."""
+    """Find the loaded libraries, in 1 to 4 ms; another number of `modules` searches again."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
