@@ -340,7 +340,7 @@ def report(output: Output, summary: BuildSummary) -> None:
 
             store, built = options.opened(summary.store), output.command == "build-store"
             # What a dataset definition may say is of no use to `subset` and `concat`.
-            show_quality(output, overview_of(store), advise=built)
+            show_quality(output, overview_of(store), summary.store, advise=built)
             show_errors(store)
             if output.verbosity > 0:
                 names = ("asset_id", "verdict", "confidence", "fitness")

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from slatprep.cli import options
-from slatprep.cli.output import Cell, Output, as_typed, say, write_csv
+from slatprep.cli.output import Cell, Output, say, write_csv
 from slatprep.cli.signature import Click, command
 from slatprep.errors import apart_from
 
 if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
     from slatprep.inspect.statistics import Distribution, GroupStatistics, StoreStatistics
+    from slatprep.records import Place
     from slatprep.store import Store
 
 
@@ -48,8 +49,8 @@ def info(output: Output, store: options.LastStore) -> None:
             "engine": ", ".join(overview.engines),
             "model": ", ".join(overview.models),
         }
-        output.record(f"Store {as_typed(overview.store)}", contents)
-        show_quality(output, overview)
+        output.record(f"Store {store}", contents)
+        show_quality(output, overview, store)
         show_errors(opened)
         show_unusual(unusual)
         output.table(
@@ -61,14 +62,19 @@ def info(output: Output, store: options.LastStore) -> None:
             ],
         )
 
-    output.result(vars(overview) | {"errors": told_of(opened), "unusual": unusual}, show)
+    told = {"store": store, "errors": told_of(opened), "unusual": unusual}
+    output.result(vars(overview) | told, show)
 
 
-def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True) -> None:
-    """Print how good the alignments of a store are, which assets to look at, and how."""
+def show_quality(
+    output: Output, overview: StoreOverview, store: Place, *, advise: bool = True
+) -> None:
+    """Print how good the alignments of a store are, which assets to look at, and how.
+
+    `store` is its place as it was typed: a version on an object store is gone two builds later.
+    """
     from slatprep.inspect.overview import UNKNOWN
     from slatprep.judge import THRESHOLDS
-    from slatprep.storage.versions import is_version
 
     figures = ("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
@@ -84,9 +90,6 @@ def show_quality(output: Output, overview: StoreOverview, *, advise: bool = True
     unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)
     if unknown and advise:
         say(f"unknown: the category of {unknown:,}; {_source_of_categories(overview)}")
-    store = as_typed(overview.store)
-    if not isinstance(store, Path) and is_version(store):  # It is gone two builds later.
-        store = store.parent.parent
     doubted = [name for name, count in total.verdicts.items() if count and name != "good"]
     if doubted:
         options = " ".join(f"--verdict {name}" for name in doubted)
@@ -292,7 +295,7 @@ def stats(
         from slatprep.inspect.pictures.statistics import draw_statistics
 
         options.draw_to(output, picture, partial(draw_statistics, opened, found))
-    output.result(found, lambda: _show_statistics(output, found))
+    output.result(vars(found) | {"store": store}, lambda: _show_statistics(output, found))
 
 
 def _show_statistics(output: Output, found: StoreStatistics) -> None:

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import is_dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -24,9 +24,6 @@ from slatprep.cli.streams import emit
 from slatprep.errors import SlatprepError, in_unicode, printable
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
-
-if TYPE_CHECKING:
-    from slatprep.records import Place
 
 EXIT_INCOMPLETE, EXIT_USAGE, EXIT_UNPRINTED, EXIT_INTERRUPTED = 1, 2, 3, 130
 
@@ -189,14 +186,6 @@ def _for_spreadsheet(value: object) -> object:
 def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
     """Print text through `printable`; all commands print with this function."""
     emit(printable(str(text)), err=err, nl=nl)
-
-
-def as_typed(place: Place) -> Place:
-    """Return a place as people type it: from the working folder, if it lies below that."""
-    here = Path.cwd()
-    if isinstance(place, Path) and place.is_relative_to(here):
-        return place.relative_to(here)
-    return place
 
 
 OUTPUT_OPTIONS = (

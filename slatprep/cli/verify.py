@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -130,6 +131,7 @@ def diff(
         worst = _SHOWN
     with output.progress("diff") as progress:
         found = compare_stores(a, b, worst=worst, jobs=jobs, progress=progress)
+    found = replace(found, a=a, b=b)  # As they were typed.
     output.result(found, lambda: _show_difference(output, found), complete=found.same)
 
 
