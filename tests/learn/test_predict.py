@@ -19,7 +19,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from support import commands
 from support.commands import document, refused
-from support.made_store import make_store
+from support.made_store import edit_attributes, make_store
 
 from slatprep import InputError, open_store
 from slatprep.extract import Session
@@ -309,6 +309,23 @@ def test_decoders_get_latents_as_trellis_draws_them(learn_store, tmp_path, trell
     assert "out of memory. Tried to allocate 20 GiB" in problem and problem in result.stderr
     np.testing.assert_allclose(trellis.feats, latents.feats, atol=1e-5)
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply"]
+
+
+def test_standardised_latents_of_a_store_and_an_encoder_of_equal_moments_are_input(
+    checkpoint, learn_store, tmp_path, trellis
+):
+    store = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
+    plain = open_store(learn_store).asset("a")
+    feats = zarr.open_group(store, mode="r+")["voxel/feats"]
+    feats[:] = (feats[:] - np.array(FEATS_MEAN)) / np.array(FEATS_STD)
+    latents = open_store(store).attributes["latents"]
+    edit_attributes(store, latents=latents | {"standardised": True, "encoder": "sam3d"})
+    step("decode-slat", store, "--asset", "a", "--out", tmp_path / "gaussians")
+    np.testing.assert_allclose(trellis.feats, plain.feats, atol=1e-5)
+    for path, out in ((learn_store, "plain"), (store, "standardised")):
+        run(path, "--checkpoint", checkpoint, "--asset", "a", "--out", tmp_path / out)
+    said = (np.load(tmp_path / out / "a.npz")["properties"] for out in ("plain", "standardised"))
+    np.testing.assert_allclose(*said, atol=1e-5)
 
 
 def test_latents_of_another_encoder_are_no_input(checkpoint, tmp_path):

@@ -15,7 +15,6 @@ from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
 from slatprep.store import open_store
 from slatprep.store.integrity import write_digests
 from slatprep.store.layout import FILE
-from slatprep.store.records import StoredRecords
 
 RECORDS = "asset/record/c/0"
 
@@ -75,18 +74,25 @@ def test_rows_that_are_gone_are_written_again(built):
 
 
 @pytest.mark.filterwarnings("ignore:Consolidated metadata")
-def test_a_transform_that_gives_other_labels_is_found_anew(built, undisturbed, aligned):
+@pytest.mark.parametrize("what", ["transform", "class"])
+def test_a_transform_or_a_class_that_sources_do_not_give_is_found_anew(
+    built, undisturbed, aligned, what
+):
     """Every checksum and digest is right, and yet the record is not of these rows."""
     _, out = built
 
     def shift(record: dict[str, Any]) -> None:
         record["alignment"]["transform"][0][3] += 0.25
 
-    edit_record(out, 1, shift)
+    if what == "class":
+        asset = open_store(out).asset("b")
+        other = 1 - asset.material[asset.valid][0] % 2
+        rewrite(out, "voxel/material", open_store(out).offsets[1] + asset.valid.argmax(), other)
+    else:
+        edit_record(out, 1, shift)
     shutil.rmtree(out / FILE)
     write_digests(out)
     zarr.consolidate_metadata(str(out), zarr_format=3)
-    assert StoredRecords(open_store(out)).of("b").alignment.transform[0, 3] > 0.2
     (told,) = rebuilt(built, undisturbed).damaged
     assert told.startswith("b: ")
     assert aligned == ["b"]

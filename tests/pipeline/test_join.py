@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import run
-from support.made_store import edit_attributes
+from support.made_store import edit_attributes, rewrite
 from support.synthetic import Dataset
 from support.trees import copied, records_of, tree
 
@@ -102,6 +102,11 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path
             assert np.array_equal(getattr(one, name), getattr(other, name))
         for name in ("properties", "grid_properties"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6)
+    for name in ("clipped", "clipped_grid"):
+        lost = copied(tmp_path / "b.zarr", tmp_path / f"{name}.zarr")
+        rewrite(lost, f"asset/{name}", 0, (0, 1, 0))
+        with pytest.raises(StoreError, match="values of b were clipped to its ranges, so it cannot"):
+            concat_stores([tmp_path / "a.zarr", lost], tmp_path / "all.zarr")
 
 
 def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):

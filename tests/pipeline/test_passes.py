@@ -1,5 +1,6 @@
 """The passes over a whole dataset: the consensus, and the witness of telling latents."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 import zarr
 from support.trees import copied, inodes, records_beside, tree
 
-from slatprep import load_parameters, make_demo, open_store
+from slatprep import load_parameters, make_demo, open_store, subset_store
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.score import score_against_truth
 from slatprep.inspect.verify import verify_store
@@ -102,6 +103,23 @@ def test_building_without_it_brings_the_first_placements_back(habitual, agreed, 
     sure = open_store(store).column("ambiguity") <= THRESHOLDS.good_ambiguity
     assert advice.startswith(f"{(~sure).sum()} of {len(sure)} assets have other placements")
     assert "others share a rotation" in advice
+
+
+def test_a_subset_that_is_built_again_is_settled_by_its_own_assets(habitual, agreed, tmp_path):
+    alone, together = map(records_beside, agreed)
+    moved = next(name for name, record in together.items() if record["first_pass"])
+    shutil.copytree(habitual[0] / "pixieverse" / moved, tmp_path / "pixieverse" / moved)
+    (tmp_path / "slat").mkdir()
+    shutil.copy(habitual[0] / "slat" / f"{moved}.npz", tmp_path / "slat")
+    own = {"pixieverse": {"root": tmp_path / "pixieverse"}, "slat": {"root": tmp_path / "slat"}}
+    given = {"normalize": {"ranges": "pixie"}, "consensus": {"settle": True}}
+    of_all, of_own = (load_parameters(habitual[0] / "dataset.toml", g) for g in (given, given | own))
+    whole, out = copied(agreed[1], tmp_path / "whole.zarr"), tmp_path / "out.zarr"
+    build_store(of_all, whole)
+    subset_store(whole, out, [moved])
+    assert records_beside(out)[moved]["alignment"] == together[moved]["alignment"]
+    build_store(of_own, out)
+    assert records_beside(out)[moved]["alignment"] == alone[moved]["alignment"]
 
 
 @pytest.fixture(scope="module")
