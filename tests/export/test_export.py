@@ -50,6 +50,7 @@ def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
             np.testing.assert_allclose(group["transform"][:], QUARTER_TURN, atol=2e-3)
             assert group["valid"][:].all() and (group["distance"][:] < 0.01).all()
             assert list(group["properties_si"].attrs["units"]) == ["Pa", "kg/m^3", "1"]
+            assert group["distance"].attrs["units"] == "voxel"
             hold_truth(group["material"][:], *group["properties_si"][:].T)
             assert (np.abs(group["properties"][:]) <= 1).all()
 

@@ -37,9 +37,30 @@ def test_ranges_that_pixie_publishes_are_no_surprise():
     assert told(USUAL, ((3.2, 10.8), (1.8, 9.7), (0.21, 0.45))) == []  # which of two?
 
 
+def test_a_build_that_only_takes_assets_away_tells_of_no_range_again(make_dataset, tmp_path):
+    dataset = make_dataset(*"abcf")
+    grid = dataset.assets["f"].grid
+    grid[..., 1] *= 1e6
+    dataset.write_grid("f", grid)
+    parameters = dataset.parameters(pixieverse={"plausibility": "off"})
+    first = build_store(parameters, tmp_path / "s.zarr").warnings
+    assert any("f alone makes the range of youngs_modulus" in text for text in first)
+    dataset.remove("a")
+    assert not any(
+        "alone" in text for text in build_store(parameters, tmp_path / "s.zarr").warnings
+    )
+
+
 @pytest.fixture
 def dataset(make_dataset: MakeDataset) -> Dataset:
     return make_dataset(*"abcdef")
+
+
+def still_channel(dataset: Dataset, name: str) -> None:
+    """Give the latents of an asset a channel that is the same throughout."""
+    asset = dataset.assets[name]
+    asset.feats[:, 7] = 1
+    dataset.write_slat(f"{name}.npz", asset.coords, asset.feats)
 
 
 def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
@@ -77,9 +98,11 @@ def test_unusual_values_are_told_with_what_refused_ones_look_like(dataset, tmp_p
         some = tuple(inside[: int(len(inside) * (0.4 if name == "c" else 1))].T)
         grid[some] = (300, 0.5, 0.3, 5)
         dataset.write_grid(name, grid)
+    still_channel(dataset, "d")
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     assert [name for name, _ in summary.problems] == ["a", "b"]
-    (text,) = [text for text in summary.warnings if "unusual" in text]
+    latents, text = (text for text in summary.warnings if "unusual" in text)
+    assert latents.startswith("latents of 1 of 4 assets (d) are unusual") and "MPa" not in latents
     assert text.startswith(
         "values of 1 of 4 assets (c) are unusual: class snow (40% of the voxels)"
     )
@@ -91,9 +114,7 @@ def test_odd_sources_are_told_by_the_build_and_of_its_store(dataset, tmp_path):
     for name, mask in occupied.items():
         path = dataset.root / "pixieverse" / name / "clip_features_mask.npy"
         np.save(path, np.roll(mask, 3, axis=0))
-    asset = dataset.assets["c"]
-    still = np.column_stack([asset.feats[:, :7], np.ones(len(asset.feats), np.float32)])
-    dataset.write_slat("c.npz", asset.coords, still)
+    still_channel(dataset, "c")
     out = tmp_path / "s.zarr"
     words = ("build-store", "--pixieverse", dataset.root / "pixieverse", "--slat",
              dataset.root / "slat", "--out", out, "--decoys", "0")  # fmt: skip

@@ -16,6 +16,8 @@ from slatprep.inspect.verify import verify_store
 from slatprep.judge import THRESHOLDS
 from slatprep.parameters import BuildParameters, ConsensusParameters, WitnessParameters
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.notices import shared_rotation
+from slatprep.pipeline.rows import NextStore, Row, SourceStore
 
 SETTLED = ConsensusParameters(settle=True)
 HEARD = WitnessParameters(settle=True)
@@ -103,6 +105,11 @@ def test_building_without_it_brings_the_first_placements_back(habitual, agreed, 
     sure = open_store(store).column("ambiguity") <= THRESHOLDS.good_ambiguity
     assert advice.startswith(f"{(~sure).sum()} of {len(sure)} assets have other placements")
     assert "others share a rotation" in advice
+    # It is for assets that were read now.
+    taken = SourceStore(open_store(store))
+    rows = [Row(name, 1, store=0, row=row) for row, name in enumerate(taken.ids)]
+    how = taken.normalization, taken.contents, taken.build, parameters.store
+    assert list(shared_rotation(NextStore(rows, (taken,), *how))) == []
 
 
 def test_a_subset_that_is_built_again_is_settled_by_its_own_assets(habitual, agreed, tmp_path):
@@ -113,7 +120,9 @@ def test_a_subset_that_is_built_again_is_settled_by_its_own_assets(habitual, agr
     shutil.copy(habitual[0] / "slat" / f"{moved}.npz", tmp_path / "slat")
     own = {"pixieverse": {"root": tmp_path / "pixieverse"}, "slat": {"root": tmp_path / "slat"}}
     given = {"normalize": {"ranges": "pixie"}, "consensus": {"settle": True}}
-    of_all, of_own = (load_parameters(habitual[0] / "dataset.toml", g) for g in (given, given | own))
+    of_all, of_own = (
+        load_parameters(habitual[0] / "dataset.toml", g) for g in (given, given | own)
+    )
     whole, out = copied(agreed[1], tmp_path / "whole.zarr"), tmp_path / "out.zarr"
     build_store(of_all, whole)
     subset_store(whole, out, [moved])

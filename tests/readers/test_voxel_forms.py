@@ -60,6 +60,17 @@ def in_order(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: column[order] for name, column in rows.items() if name != "segment"}
 
 
+def write_vomp(folder: Path, rows: dict[str, np.ndarray]) -> None:
+    """Write a file of VoMP's dataset by hand: rows of corners in [-0.5, 0.5) and SI values."""
+    row = "f4,f4,f4,f4,f4,f4,U32"
+    corners = (rows["voxels"] * 0.015625 - 0.5).T
+    materials = [rows[name] for name in ("youngs_modulus", "poissons_ratio", "density")]
+    data = np.rec.fromarrays([*corners, *materials, np.full(len(rows["voxels"]), "seat")], row)
+    data.dtype.names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density", "segment_id")
+    folder.mkdir()
+    np.savez_compressed(folder / "a_with_materials.npz", voxel_data=np.asarray(data))
+
+
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     sources.write_description(tmp_path / "voxels", TABLE, CLASSES)
@@ -72,7 +83,7 @@ def test_every_form_holds_the_same_72_000_voxels(root, form):
     if form == "ply":
         del rows["segment"]  # Its vertices have no column of another length.
     if form == "vomp":
-        sources.write_vomp(root, "a", rows["voxels"], rows)
+        write_vomp(root / "voxels", rows)
     elif form == "physxnet":
         sources.write_physxnet(root, "a", rows["voxels"], rows["density"])
     else:
