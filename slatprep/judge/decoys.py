@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, minimize
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from slatprep.geometry.frames import Array
 from slatprep.judge.calibration import SAME_OBJECT
@@ -111,7 +111,7 @@ def error_rates(
     draws of `seed`.
     """
     refitted = len(targets) >= LEAST_TARGETS and len(decoys) >= LEAST_DECOYS
-    scores, decoy_scores = (logit(SAME_OBJECT.probability(values)) for values in (targets, decoys))
+    scores, decoy_scores = map(_shipped_scores, (targets, decoys))
     if refitted:
         scores, decoy_scores = _refitted(targets, decoys, target_folds, decoy_folds)
     rng = np.random.default_rng(seed)
@@ -145,15 +145,14 @@ def _wrong_share(
 ) -> tuple[float, Array]:
     """Estimate the share of targets that score as decoys do; return also draws of it."""
     limit = np.quantile(decoy_scores, 1.0 - LIKE_DECOYS, method="higher")
-    below = int(np.count_nonzero(scores < limit))
-    of_decoys = float(np.mean(decoy_scores < limit)) or 1.0
-    # Half of one, and half of none, as nobody has seen all of them.
-    drawn = rng.beta(below + 0.5, len(scores) - below + 0.5, DRAWS)
-    of_drawn = rng.beta(
-        of_decoys * len(decoy_scores) + 0.5, (1 - of_decoys) * len(decoy_scores) + 0.5, DRAWS
-    )
-    share = min(below / len(scores) / of_decoys, 1.0)
-    return share, np.minimum(drawn / of_drawn, 1.0)
+    low, low_decoys = (float(np.mean(values <= limit)) for values in (scores, decoy_scores))
+
+    def drawn(share: float, count: int) -> Array:
+        # Half of one, and half of none, as nobody has seen all of them.
+        return rng.beta(share * count + 0.5, (1 - share) * count + 0.5, DRAWS)
+
+    shares = drawn(low, len(scores)) / drawn(low_decoys, len(decoy_scores))
+    return min(low / low_decoys, 1.0), np.minimum(shares, 1.0)
 
 
 def _surpassed(scores: Array, by: Array) -> NDArray[np.intp]:
@@ -213,14 +212,20 @@ def _refitted(
     return scores[: len(targets)], scores[len(targets) :]
 
 
+def _shipped_scores(evidence: Array) -> Array:
+    """Return the shipped model's logarithms of the odds, between -15 and 15."""
+    # Not of its probabilities: most decoys have the least that it states.
+    odds: Array = SAME_OBJECT.contributions(evidence).sum(axis=1) + SAME_OBJECT.intercept
+    return odds.clip(-15.0, 15.0)
+
+
 def _features(evidence: Array, decoy: NDArray[np.bool_]) -> Array:
     """Return the shipped model's score and `LEARNED`, better where larger, in decoys' spreads."""
-    score = SAME_OBJECT.contributions(evidence).sum(axis=1) + SAME_OBJECT.intercept
     columns = [FIGURES.index(name) for name in LEARNED]
     chosen = np.nan_to_num(evidence[:, columns] * np.array(list(LEARNED.values())))
     centre, spread = chosen[decoy].mean(axis=0), chosen[decoy].std(axis=0)
     others = np.clip((chosen - centre) / np.maximum(spread, 1e-9), -4.0, 4.0)
-    return np.column_stack([np.clip(score, -15.0, 15.0), others])
+    return np.column_stack([_shipped_scores(evidence), others])
 
 
 def _fit(right: Array, wrong: Array) -> Array:

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.special import logit
+from scipy.special import expit
 from support.demos import Case, made_cases
 from support.shapes import GRID, chair, field_of, surface_latents
 
@@ -17,6 +17,7 @@ from slatprep.judge import THRESHOLDS, evidence, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import causes_of_doubt
 from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
+from slatprep.judge.model import FLOOR
 from slatprep.judge.verdict import LEAST_TARGETS
 from slatprep.normalize import (
     PIXIE_RANGES,
@@ -90,6 +91,18 @@ def called_good(targets: np.ndarray, decoys: np.ndarray) -> dict[str, np.ndarray
     }
 
 
+@pytest.mark.parametrize("far", [0.7, 1.4, 5.0])
+def test_wrong_pairs_that_score_as_low_as_scores_go_are_counted(far):
+    # All of them, and all decoys, at the floor of probability, or of the score.
+    targets = np.concatenate([right(20), made(10, (far, far), 3)])
+    found = rated(targets, made(25, (far, far), 4))
+    low, high = found.wrong_share_range
+    assert not found.refitted
+    assert low <= 1 / 3 <= high
+    assert abs(found.wrong_share - 1 / 3) < 0.15
+    assert found.errors[20:].min() > 0.9 > 0.5 > found.errors[:20].max()
+
+
 @pytest.mark.parametrize("mixed", [0, 20, 80, 160])
 def test_the_stated_rates_are_the_true_ones(mixed):
     count = 400
@@ -131,7 +144,9 @@ def test_few_assets_are_judged_by_the_shipped_model(count):
     targets = right(count)
     found = rated(targets, wrong(count))
     assert not found.refitted
-    np.testing.assert_allclose(found.scores, logit(SAME_OBJECT.probability(targets)))
+    # Its probabilities have a floor, where scores go on.
+    likely = np.clip(expit(found.scores), FLOOR, 1 - FLOOR)
+    np.testing.assert_allclose(likely, SAME_OBJECT.probability(targets))
     assert 0.0 <= found.wrong_share_range[0] <= found.wrong_share_range[1] <= 1.0
 
 
