@@ -123,8 +123,8 @@ def list_extractions(
 ) -> list[Extraction]:
     """Name the files for each image and seed, below the root `out` that `build-store` takes.
 
-    They are ``<id>.npz``, or ``<id>/<view>.npz`` where there are views: folders, several seeds,
-    or both (``<view>-seed-<seed>``). ConfigError if a name cannot be an id, or is there twice.
+    They are ``<id>.npz``, or ``<id>/<view>.npz`` if there are views: folders, several seeds, or
+    both (``<view>-seed-<seed>``). ConfigError if a name cannot be an id, or occurs twice.
     """
     listed: dict[Path, Extraction] = {}
     for image in images:
@@ -154,9 +154,9 @@ def extract(
 ) -> Iterator[Extracted | InputError]:
     """Run the pipeline, and save latents with their provenance, one image and seed at a time.
 
-    Without `preprocess` the images have no background and are cropped already. Yields the result
-    of each, or why it failed, which does not stop the others. An existing SLAT whose record has
-    the same image, seed and model is kept, whatever versions of slatprep and torch made it.
+    Without `preprocess` the images must be cropped and without background. Yields the result of
+    each, or its error, which does not stop the others. An existing SLAT is kept if its record has
+    the same image, seed, model and settings; versions of slatprep and torch may differ.
     """
     for extraction in extractions:
         try:
@@ -188,9 +188,9 @@ def decode_gaussians(session: Session, latents: StructuredLatents, path: Path) -
 
 @contextmanager
 def _named(path: Path, what: str) -> Iterator[None]:
-    """Name the file for which TRELLIS or torch raises an error; keep their prints off stdout.
+    """Raise errors of TRELLIS and torch as InputError with the file; keep prints off stdout.
 
-    RuntimeError: no memory left. ValueError: `preprocess_image` finds no foreground.
+    RuntimeError means no memory left, ValueError that `preprocess_image` finds no foreground.
     """
     try:
         with redirect_stdout(sys.stderr):
@@ -219,7 +219,7 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
         "slat_normalization": dict(pipeline.slat_normalization),
         "feats": _LATENTS,
     }
-    # As JSON and back, so that it equals a record that was read: lists for tuples and arrays.
+    # Through JSON and back, to equal a record that was read: lists for tuples and arrays.
     text = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
     record: dict[str, Any] = orjson.loads(text)
     if extraction.slat.exists():
@@ -266,7 +266,7 @@ def _kept(extraction: Extraction, record: dict[str, Any]) -> Extracted:
 
 
 def _asked_for(record: dict[str, Any]) -> dict[str, Any]:
-    """Return a record without versions and words: what a stopped run may go on with."""
+    """Return the entries of a record that must be equal for a SLAT to be kept: no versions."""
     model = {name: value for name, value in record["model"].items() if name != "torch"}
     rest = {name: value for name, value in record.items() if name not in ("slatprep", "feats")}
     return rest | {"model": model}

@@ -1,14 +1,14 @@
 """Latents of images by TRELLIS, TRELLIS.2 or SAM 3D Objects: one file that runs alone.
 
 TRELLIS's set-up makes a Python 3.10, in which slatprep cannot be installed. Copy this file there
-and run it; it needs numpy, and of the generator what its own set-up brings:
+and run it. It needs numpy and the packages that the generator's set-up installs:
 
     python trellis_latents.py images/*.png --out slat
     python trellis_latents.py images/*.png --out slat --generator trellis2 --pipeline 1024
     python trellis_latents.py images/*.png --out slat --generator sam3d
 
-Each image gives <id>.npz, with several seeds <id>/seed-<seed>.npz, as `slatprep build-store` reads
-them. `slatprep extract-slat` does the same in a Python 3.11 with TRELLIS, by the same calls.
+Each image gives <id>.npz, or <id>/seed-<seed>.npz with several seeds, as `slatprep build-store`
+reads them. `slatprep extract-slat` makes the same calls in a Python 3.11 with TRELLIS.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 if __name__ == "__main__" and (Path(__file__).parent / "inspect").is_dir():
-    sys.path[0] = str(Path.cwd())  # Not slatprep's folder, whose `inspect` is not Python's.
+    sys.path[0] = str(Path.cwd())  # Not slatprep's folder: its `inspect` hides Python's.
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class Stages(dict[str, float]):
         self.torch, self.device, self.begin = torch, device, time.perf_counter()
 
     def end(self) -> None:
-        """End a stage; kernels run asynchronously."""
+        """End a stage and keep its seconds; wait for kernels, which run asynchronously."""
         if str(self.device).startswith("cuda"):
             self.torch.cuda.synchronize()
         now = time.perf_counter()
@@ -101,7 +101,7 @@ def sample_trellis2(
 def sample_sam3d(inference: Any, torch: Any, image: Any, seed: int) -> Sampled:
     """Sample by SAM 3D Objects' `Inference` of its notebook; the image's alpha is the mask.
 
-    Its pipeline returns Gaussians and meshes. The latents are what it hands to `decode_slat`.
+    Its pipeline returns Gaussians and meshes. It passes the latents to `decode_slat`.
     """
     pipeline, seen = inference._pipeline, []
     decode = pipeline.decode_slat
@@ -190,13 +190,13 @@ def move(pipeline: Any, torch: Any, device: str | None) -> str:
 
 
 def load(options: argparse.Namespace) -> Callable[[Any, int], Sampled]:
-    """Load the generator, and return what samples an image with a seed."""
+    """Load the generator, and return a function that samples an image with a seed."""
     with redirect_stdout(sys.stderr):
         import torch
 
         preprocess = not options.no_preprocess
         if options.generator == "sam3d":
-            sys.path.append("notebook")  # Of SAM 3D Objects' own checkout.
+            sys.path.append("notebook")  # In SAM 3D Objects' checkout.
             from inference import Inference  # type: ignore[import-not-found]
 
             loaded = Inference(options.model or "checkpoints/hf/pipeline.yaml", compile=False)

@@ -22,21 +22,21 @@ PositiveInt = Annotated[int, Gt(0)]
 """A whole number above 0."""
 
 MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, MAX_GRID_SHARD = 2**20, 2**28, 2**16
-"""Rows of one chunk and of one shard of the voxel arrays, assets of one shard of the grids:
-what a store may have to be read, and so what it may be told to be built with."""
+"""Most rows of a chunk and of a shard of the voxel arrays, and most assets of a shard of the grids,
+for a store that is built or read."""
 
 MAX_ALSO = 15
 """Most further sources of a dataset."""
 
 MAX_SHARD_CHUNKS = 2**20
-"""Chunks per shard; a reader keeps their index in memory."""
+"""Most chunks per shard; a reader keeps their index in memory."""
 
 NAMED_SPLITS, CATEGORY = ("hash", "pixie"), "category:"
-"""Words that `NormalizeParameters.split_by` may be or begin with, besides a path."""
+"""Named rules of `NormalizeParameters.split_by`, and the prefix of a rule by category."""
 
 
 class _Group:
-    """Settings by which `slatprep.parameters.files` has pydantic check every group."""
+    """Base class of the groups, with the settings by which pydantic checks them."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "allow_inf_nan": False}
 
@@ -55,20 +55,20 @@ Samples = Literal["one", "first", "all", "merge"]
 
 @dataclass(frozen=True)
 class PixieverseSource(_Group):
-    """Where the PixieVerse side lies.
+    """Location of the PixieVerse side, and how to read it.
 
     Patterns are relative to `root` and name ``{id}`` (one path component) and optionally
-    ``{sample}``. For each object, the first grid pattern with a match counts. `sample` names the
-    sample to take. Otherwise `samples` decides what becomes of several: an error (``one``), the
+    ``{sample}``. For each object, the first grid pattern with a match is used. `sample` names the
+    sample to take. Otherwise `samples` decides how several are treated: an error (``one``), the
     lowest (``first``), an asset for each (``all``), or an asset with merged labels (``merge``).
 
     `adapter` reads the source; it is one of `slatprep.readers.adapters.SOURCES` or another
     package's. `transform` is for the engine ``known``: the file with the transform to the SLAT
     frame, or a pattern that names ``{id}``.
 
-    `units` says what the files hold, where it is not SI units. `plausibility` decides what becomes
-    of values that no material has: the asset is refused (``refuse``), or they are taken as they
-    are, with a warning (``warn``) or without (``off``).
+    `units` states the units of the files if they are not SI units. `plausibility` decides how
+    values that no material has are treated: the asset is refused (``refuse``), or they are used
+    unchanged, with a warning (``warn``) or without (``off``).
     """
 
     root: PlaceText
@@ -93,15 +93,15 @@ class PixieverseSource(_Group):
 
 @dataclass(frozen=True)
 class SlatSource(_Group):
-    """Where the SLAT side lies.
+    """Location of the SLAT side, and how to read it.
 
-    Patterns are relative to `root` and name ``{id}`` and optionally ``{view}``. Where `root` is an
+    Patterns are relative to `root` and name ``{id}`` and optionally ``{view}``. If `root` is an
     HDF5 file, or a pattern names no ``{id}``, the file has a group for each asset, named by
     `group`.
 
     `encoder` made the latents: a name of `slatprep.records.encoders.LATENTS`, or the path of a JSON
-    file that describes another. `standardised` says whether they are standardised already; with
-    ``auto``, their values decide.
+    file that describes another encoder. `standardised` says whether latents are standardised
+    already; with ``auto``, their values decide.
     """
 
     root: PlaceText
@@ -122,7 +122,7 @@ class SlatSource(_Group):
 
 @dataclass(frozen=True)
 class PairingParameters(_Group):
-    """How to join the names of the two sides where they differ.
+    """How to join the names of the two sides if they differ.
 
     `map` is a CSV with columns ``object_id`` and ``slat_id`` (and optionally ``view``), or
     TRELLIS's ``metadata.csv`` (``sha256``, ``file_identifier``). `categories` is Pixie's
@@ -159,7 +159,7 @@ class ConsensusParameters(_Group):
 
     With `settle`, a second pass treats assets whose geometry cannot decide between placements. Each
     gets the placement nearest to the rotation that most assets without a tie share. An asset
-    without a tie that is turned otherwise gets it where shape and dataset together say so.
+    without a tie that is turned otherwise gets it if shape and dataset together favour it.
     """
 
     settle: bool = False
@@ -199,11 +199,11 @@ class SampleParameters(_Group):
 
 @dataclass(frozen=True)
 class NormalizeParameters(_Group):
-    """Where the ranges come from.
+    """Origin of the ranges.
 
     `ranges` is ``dataset`` (its minimum and maximum), percentiles of it such as ``p1-p99``,
     ``pixie``, or the path of a TOML, JSON or YAML file. The dataset's ranges come from ``all`` its
-    `objects`, or from those of ``train``, which `split_by` and `shares` define: see
+    `objects`, or from the objects of ``train``, which `split_by` and `shares` define: see
     `slatprep.readers.splits.assign_splits`.
     """
 
@@ -234,7 +234,7 @@ def percentiles_of(ranges: str) -> tuple[float, float] | None:
 
 
 def is_split_file(by: str) -> bool:
-    """Whether the rule of a split is a file of ids, and not a named rule."""
+    """Return whether the rule of a split is a file of ids, and not a named rule."""
     return by not in NAMED_SPLITS and not by.startswith(CATEGORY)
 
 
@@ -297,7 +297,7 @@ class BuildParameters(_Group):
 class Preset:
     """Named parameters of the stages that decide which annotation a SLAT voxel gets.
 
-    Without ranges of its own, a preset keeps those of the file.
+    If `normalize` is None, the file's ranges are kept.
     """
 
     align: AlignParameters = AlignParameters()

@@ -58,7 +58,7 @@ OPTIONS = {
     "normalize.split_by": "--split-by",
     "normalize.shares": "--shares",
 }
-"""The options that give a value of the file, by its key."""
+"""Option of the command line for a key of the file."""
 
 _PATHS = (
     "pixieverse.root", "also.root", "slat.root", "slat.encoder", "pairing.map",
@@ -112,15 +112,15 @@ def load_parameters(
 
 
 def checked(kind: type[_Group], given: _Group) -> _Group:
-    """Return parameters made in Python, checked as those of a file; ConfigError as there."""
+    """Check parameters that were made in Python as those of a file; ConfigError if they fail."""
     if not isinstance(given, kind):
         raise ConfigError(f"parameters are {given!r:.80}; expected those of load_parameters")
     return _validated(kind, asdict(given), _Origin(kind.__name__, {}))
 
 
 def _validated(kind: type[_Group], data: Mapping[str, Any], origin: _Origin) -> _Group:
-    """Return parameters of tables of values; ConfigError where one makes no sense."""
-    # Late: pydantic takes a third of a second that `slatprep --help` does not have.
+    """Make parameters from tables of values; ConfigError if a value makes no sense."""
+    # Imported late: pydantic takes a third of a second, too much for `slatprep --help`.
     from pydantic import ValidationError
 
     for name, table, key in _paths_of(data):
@@ -130,13 +130,13 @@ def _validated(kind: type[_Group], data: Mapping[str, Any], origin: _Origin) -> 
                 f"{origin.of(name)}: {name}: {path} is no UTF-8, so that no record can hold it; "
                 "rename the folder"
             )
-    # Through JSON, because strict JSON takes a list for a tuple and a string
-    # for a path as TOML has them, and still refuses "3" and true for 3.0.
+    # Through JSON: strict JSON takes a list for a tuple and a string for a path, as TOML has them,
+    # and still refuses "3" and true for 3.0.
     document = json.dumps(data, default=_plain)
     try:
         return read_as(kind, document)
     except ValidationError as error:
-        # One line, one repair: a misspelt key first, because it makes another one missing.
+        # Only one fault is told: a misspelt key first, because it makes another key missing.
         faults = sorted(error.errors(), key=lambda fault: fault["type"] != _UNKNOWN_KEY)
         raise ConfigError(_explain(faults[0], origin)) from None
 
@@ -146,7 +146,7 @@ def _plain(value: object) -> object:
 
 
 class _Origin(NamedTuple):
-    """The origin of values, for error messages that lead back to them."""
+    """The origin of values, for error messages."""
 
     config: Path | str | None
     overrides: Overrides
@@ -182,13 +182,13 @@ def _read(path: Path) -> dict[str, Any]:
         if isinstance(value, str) and value and _is_path(key, value):
             try:
                 table[key] = str(place_of(value, folder))
-            except RuntimeError as error:  # ~user, where there is no such user.
+            except RuntimeError as error:  # The user of ~user does not exist.
                 raise ConfigError(f"{path}: {name}: {value}: {error}") from None
     return data
 
 
 def _faults_in(value: object, keys: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield what no key may hold: TOML allows more than files, JSON and processors do."""
+    """Yield the faults of values that TOML allows, but file names, JSON or int64 do not."""
     name = ".".join(keys)
     if len(keys) > _MOST_KEYS:
         yield f"{name} ...: nested too deeply; expected a table and its keys"
@@ -215,7 +215,7 @@ def _paths_of(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], st
 
 
 def _is_path(key: str, value: object) -> bool:
-    """Whether the value of an entry of `_PATHS` is a path and not a word."""
+    """Return whether the value of an entry of `_PATHS` is a path and not a word."""
     if key == "ranges":
         return value not in NAMED_RANGES and percentiles_of(str(value)) is None
     if key == "encoder":
@@ -249,7 +249,7 @@ def _keys_of(groups: tuple[str, ...]) -> list[str]:
     owner: Any = BuildParameters
     for group in groups:
         if group.isdecimal():
-            continue  # the number of a table of several
+            continue  # the index in an array of tables
         hint = get_type_hints(owner)[group]
         owner = next((t for t in (hint, *get_args(hint)) if is_dataclass(t)), owner)
     return [field.name for field in fields(owner)]

@@ -69,7 +69,7 @@ class VoxelField:
 
 
 def stored_field(store: Store, name: str | int, points: Points = "slat") -> VoxelField:
-    """Return the materials of an asset: of its valid SLAT voxels, or of its field, ``grid``.
+    """Return an asset's materials at its valid SLAT voxels, or at its field's voxels (``grid``).
 
     StoreError if the store has no such asset, lacks a property or has classes of its own;
     ConfigError if no voxel of the asset has a material.
@@ -110,7 +110,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     material = arrays["material"]
     named = npz_small_arrays(data, path, ArraySpec(shapes=(), kinds="U"))[0].get("columns")
     if named is not None and tuple(named.tolist()) != PROPERTY_COLUMNS:
-        raise InputError(  # Solvers need these.
+        raise InputError(  # Solvers need these columns.
             path, f"predicts {', '.join(map(str, named.ravel()))}", ", ".join(PROPERTY_COLUMNS)
         )
     values = arrays.get("properties_si")

@@ -15,7 +15,7 @@ from slatprep.records import COLOURS
 from slatprep.storage.arrays import write_ply
 
 _NEAREST = 8
-"""Particles that carry a Gaussian; a particle of a cubic lattice has eight around each cell."""
+"""Number of particles that carry a Gaussian; a cell of a cubic lattice has eight corners."""
 
 _SH = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour is 0.5 + _SH * f_dc."""
@@ -41,7 +41,7 @@ def bind(points: NDArray[np.float64], rest: NDArray[np.float64], spacing: float)
     count = min(_NEAREST, len(rest))
     distance, particles = cKDTree(rest).query(points, k=count)
     distance, particles = distance.reshape(-1, count), particles.reshape(-1, count)
-    # Relative to the nearest, so that a Gaussian far from all particles still has a carrier.
+    # Relative to the nearest particle, so that a Gaussian far from all still has a carrier.
     falloff = np.exp((distance[:, :1] ** 2 - distance**2) / (0.7 * spacing) ** 2)
     weights = falloff / falloff.sum(axis=1, keepdims=True)
     return Carrier(particles, weights, points[:, None] - rest[particles])
@@ -50,7 +50,7 @@ def bind(points: NDArray[np.float64], rest: NDArray[np.float64], spacing: float)
 def carry(
     carrier: Carrier, positions: NDArray[np.floating], gradients: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return places (G, 3) and gradients (G, 3, 3) of Gaussians by those of the particles.
+    """Return places (G, 3) and gradients (G, 3, 3) of Gaussians from positions and gradients.
 
     Each particle moves its surroundings by its position and its deformation gradient; the
     Gaussian takes the weighted mean.
@@ -77,10 +77,10 @@ def deform(
     *,
     stretch: bool = False,
 ) -> NDArray[Any]:
-    """Return Gaussians (G,) at places of the SLAT frame, turned by the gradients, else the same.
+    """Return Gaussians (G,) moved to places of the SLAT frame and turned by the gradients.
 
-    Positions and rotations are those of the file's `axes`. With `stretch` the scales follow
-    too: the covariance becomes F C F^T.
+    Positions and rotations are written in the file's `axes`. With `stretch` the scales change,
+    too: the covariance becomes F C F^T. Other fields stay the same.
     """
     from scipy.spatial.transform import Rotation
 
@@ -88,7 +88,7 @@ def deform(
     moved = vertices.copy()
     _set_columns(moved, "xyz", places @ turn.T)
     local = turn @ gradients @ turn.T
-    # Quaternions begin with the scalar.
+    # The file's quaternions begin with the scalar; scipy's end with it.
     before = Rotation.from_quat(np.roll(_columns(vertices, _ROTATION), -1, axis=1)).as_matrix()
     if stretch:
         scales = np.exp(_columns(vertices, _SCALE))
@@ -149,7 +149,7 @@ _SUFFIXES = (".gif", ".png", ".webp")
 
 
 def require_picture(path: Path) -> None:
-    """Raise ConfigError for a name that does not say a form of picture."""
+    """Raise ConfigError if a name does not end in the suffix of a picture."""
     if path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(f"{path}: expected a name that ends in {', '.join(_SUFFIXES)}")
 
@@ -163,8 +163,8 @@ def draw(
 ) -> NDArray[np.uint8]:
     """Return a picture (H, W, 3) of Gaussians at places (G, 3), z up, seen from the front left.
 
-    The view is an orthographic one of the box from `low` to `high`; each Gaussian is a disc of
-    its mean width, the nearest in front, darker toward the ground plane's far side.
+    The view is orthographic and shows the box from `low` to `high`. Each Gaussian is a disc of
+    its mean width; near discs cover distant ones, which are darker.
     """
     turn, tilt = np.radians(30.0), np.radians(15.0)
     right = np.array([np.cos(turn), np.sin(turn), 0.0])

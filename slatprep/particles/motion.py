@@ -1,4 +1,4 @@
-"""From voxels with materials and Gaussians to frames of moved Gaussians."""
+"""Turn voxels with materials, and Gaussians, into frames of moved Gaussians."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from slatprep.store import open_store
 CLASSES = MATERIAL_CLASSES[:BACKGROUND]
 
 _HELD = tuple(MATERIAL_CLASSES.index(name) for name in ("stationary", "sand"))
-"""Pots and soil, which hold in the wind what grows in them."""
+"""Classes of pots and soil, which stay fixed in the wind and hold the plants in them."""
 
 
 class Scene(NamedTuple):
     """Particles (N, 3) in the SLAT frame, their materials, and the Gaussians that they carry.
 
-    Gaussians are the rows of a PLY and their places (G, 3) in the SLAT frame.
+    `vertices` are the Gaussians as rows of a PLY, and `places` (G, 3) lie in the SLAT frame.
     """
 
     positions: NDArray[np.float64]
@@ -58,7 +58,7 @@ def prepare(
     young: float | None = None,
     density: float | None = None,
 ) -> Scene:
-    """Fill the object with a lattice of `count` particles a side, and bring its Gaussians along.
+    """Fill the object with particles, `count` to a side of the unit cube, and get its Gaussians.
 
     The SLAT's voxels `cells`, by default those of the field, are the surface of the object. Class,
     Young's modulus [Pa] and density [kg/m^3] are for the whole object; None keeps the field's.
@@ -91,7 +91,7 @@ def prepare(
 def _read(
     path: Path, axes: Axes | None, field: VoxelField, surface: VoxelField
 ) -> tuple[Particles, tuple[str, ...]]:
-    """Read Gaussians, and look whether they lie where the object does."""
+    """Read Gaussians, and check that they lie where the object does."""
     read, recognised = recognise_axes(read_particles(path, axes), field)
     doubt = doubt_axes(read, surface, transfer(read.in_slat(), surface), 2.0)
     notes = [f"{path}: {text}" for text in (recognised, doubt) if text]
@@ -106,9 +106,9 @@ def run(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Simulate the particles; return positions (F, N, 3) in the SLAT frame, and gradients.
 
-    The unit cube is `size` [m] wide and falls from `height` [m], or stands in the `wind` [m/s];
-    `times` are seconds, rate and substeps of `simulate_motion`. Without a `device` the GPU computes
-    if there is one.
+    The unit cube is `size` [m] wide. The object falls from `height` [m], or stands in the `wind`
+    [m/s] along x without gravity. `times` are seconds, rate and substeps of `simulate_motion`. The
+    default `device` is the GPU if there is one.
     """
     from slatprep.particles.simulate import preferred_device, simulate_motion
 
@@ -126,7 +126,7 @@ def run(
         device=device or preferred_device(),
         **times,
     )
-    # The first frame is where the SLAT has the object.
+    # In the first frame the object lies where the SLAT has it.
     shift = moved.positions[0] - scene.positions * size
     return (moved.positions - shift) / size, moved.gradients
 
@@ -145,7 +145,7 @@ def write_frames(
     Frames that an earlier run left in `out` are removed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for old in out.glob("frame-*.ply"):  # A longer run would leave frames behind.
+    for old in out.glob("frame-*.ply"):  # An earlier run may have more frames.
         if old.stem.removeprefix("frame-").isdigit():
             old.unlink()
     carrier = splats.bind(scene.places, scene.positions, scene.spacing)

@@ -33,7 +33,7 @@ FRAMES: dict[Axes, str] = {
     "trellis": "frame TRELLIS as it saves Gaussians, unit cube -0.5..0.5, y down",
     "glb": "frame TRELLIS as it saves meshes, unit cube -0.5..0.5, y up",
 }
-"""The comment on the frame in a PLY written here."""
+"""Comment that names the frame in a PLY of slatprep."""
 
 _GAUSSIAN = ("f_dc_0", "opacity", "scale_0", "rot_0")
 _REACH = 0.6
@@ -49,14 +49,14 @@ class Particles:
     Attributes
     ----------
     positions : ndarray of float64, shape (N, 3)
-        As in the file.
+        Positions as in the file.
     axes : {"trellis", "glb", "slat"}
         The axes of the file: those of TRELLIS's Gaussians, of its meshes, or of the SLAT frame.
     foreign : str
         Why the Gaussians are not from TRELLIS, so that their axes and scale are not known;
         empty if nothing indicates that.
     guessed : bool
-        Whether only the fields of Gaussians speak for `axes`, which SAM 3D Objects writes too.
+        Whether `axes` rests only on the fields of Gaussians, which SAM 3D Objects writes, too.
     vertices : ndarray, optional
         The rows of a PLY of Gaussians, with all attributes.
     """
@@ -76,9 +76,10 @@ class Particles:
 def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     """Read particles: a PLY with ``x y z``, an npy (N, 3), or an npz with one such array.
 
-    By default a PLY of slatprep states its axes; one with the fields of TRELLIS's Gaussians, its
-    normals, no ``f_rest_*`` and positions in the unit cube is taken for ``trellis``; all others
-    for ``slat``. InputError if the file cannot be used or holds no finite particle.
+    A PLY of slatprep states its axes. A PLY with the fields and normals of TRELLIS's Gaussians, no
+    ``f_rest_*`` and positions in the unit cube is read as ``trellis``, every other file as
+    ``slat``. `axes` overrides both. InputError if the file cannot be used, has no particle, or a
+    position is not finite.
     """
     path = Path(path)
     comments: tuple[str, ...] = ()
@@ -90,7 +91,7 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
         columns = list(_read_numpy(path).T)
     if len(columns[0]) == 0:
         raise InputError(path, "holds no particles", "at least one")
-    # Column by column: a large file that is refused is not copied first.
+    # Check column by column, so that a large file is not copied before it is refused.
     faults = [int(np.argmin(fine)) for fine in map(np.isfinite, columns) if not fine.all()]
     if faults:
         where = [float(column[min(faults)]) for column in columns]

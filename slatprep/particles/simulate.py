@@ -55,7 +55,7 @@ def simulate_motion(
     `positions` (N, 3) [m], z up, are on a cubic lattice, `spacing` [m] apart, that fills the
     object; `material` (N,) is one of `YIELDING`; `properties` (N, 3) are Young's modulus [Pa],
     density [kg/m^3] and Poisson's ratio. The lowest particle starts `height` [m] above the
-    ground, z = 0. The initial shape is taken to be without stress, so an object whose shape
+    ground, z = 0. The initial shape is treated as free of stress, so an object whose shape
     already includes the sag under its weight sags further. `wind` [m/s] presses with
     ``AIR * DRAG / 2`` times the square of the velocity relative to the particle on each free
     face that meets it; parts do not shelter each other. Particles of `fixed` (N,) do not move.
@@ -78,7 +78,7 @@ def simulate_motion(
     builder.add_particles(
         pos=[warp.vec3(*point) for point in rest],
         vel=[warp.vec3(0.0)] * len(rest),
-        mass=np.where(held, 0.0, mass).tolist(),  # The engine takes 0 for infinite.
+        mass=np.where(held, 0.0, mass).tolist(),  # For the engine 0 is infinite.
         radius=[spacing / 2] * len(rest),
     )
     builder.add_ground_plane()
@@ -126,9 +126,10 @@ def simulate_motion(
 
 
 def windward(positions: ArrayLike, wind: ArrayLike, spacing: float) -> NDArray[np.float64]:
-    """Return the area (N,) of the free faces of particles on a lattice, as the wind (3,) sees them.
+    """Return the area (N,) of particles' free upwind faces, projected along the wind (3,).
 
-    0 without a free face on the upwind side; in the square of the unit of `spacing`.
+    The particles are on a lattice. The area is in the squared unit of `spacing`, and 0 without
+    a free upwind face.
     """
     rest, way = np.asarray(positions, dtype=np.float64), np.asarray(wind, dtype=np.float64)
     area = np.zeros(len(rest))
@@ -175,5 +176,5 @@ def _engine() -> tuple[Any, Any]:
     with needing("simulation needs", "simulate"):
         import newton
         import warp
-    warp.config.log_level = warp.LOG_WARNING  # Or each kernel that it loads is a line on stdout.
+    warp.config.log_level = warp.LOG_WARNING  # Otherwise each kernel prints a line to stdout.
     return newton, warp

@@ -28,11 +28,11 @@ MANY_FAR, MOST_FAR = 0.2, 0.5
 
 
 _GAUSSIAN_AXES: tuple[Axes, Axes] = ("trellis", "slat")
-"""How TRELLIS and SAM 3D Objects save Gaussians."""
+"""Axes in which TRELLIS and SAM 3D Objects save Gaussians."""
 
 _ALIKE, _SLACK, _SAME = 1.2, 0.1, 0.99
-"""Axes fit alike if mean distances [voxel] differ by less than this factor and sum; materials are
-the same if this share of particles has the same."""
+"""Factor and sum within which two axes' mean distances [voxel] count as equal, and smallest share
+of particles with equal materials at which the choice of axes does not matter."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def transfer(
 ) -> Transferred:
     """Give each particle (N, 3) of the SLAT frame the material of the nearest voxel.
 
-    Without a voxel within `max_distance` voxels a particle is far: it gets class 7 and properties
-    0 (background), no row (drop), or the nearest voxel's material (nearest).
+    A particle without a voxel within `max_distance` voxels is far. It gets class 7 and properties 0
+    (background), no row (drop), or the nearest voxel's material (nearest).
     """
     from slatprep.geometry.nearest import Lattice
 
@@ -89,8 +89,8 @@ def recognise_axes(
 ) -> tuple[Particles, str]:
     """Tell TRELLIS's Gaussians from those of SAM 3D Objects, which have the same fields.
 
-    Returns the particles in the axes that fit, and a remark if these are not TRELLIS's.
-    ConfigError if both fit alike and give other materials, as of a ball or a crate.
+    Returns the particles with the axes that fit, and a remark if these are not TRELLIS's.
+    ConfigError if both fit alike but give different materials, as for a ball or a crate.
     """
     if not particles.guessed:
         return particles, ""
@@ -127,8 +127,8 @@ def doubt_axes(
 ) -> str:
     """Explain why many particles are far: wrong axes, another scale, or a surface of voxels.
 
-    Returns one line, empty if at most `MANY_FAR` of them are. ConfigError with the same line if
-    more than `MOST_FAR` are far, or with other axes less than a tenth as many.
+    Returns one line, empty if at most the share `MANY_FAR` is far. ConfigError with the same line
+    if more than `MOST_FAR` are far, or if other axes would leave less than a tenth of them far.
     """
     count = len(particles.positions)
     if result.far <= MANY_FAR * count:
@@ -168,7 +168,7 @@ def doubt_axes(
 
 
 def _some(particles: Particles, axes: Axes) -> NDArray[np.float64]:
-    """Return 20,000 to 40,000 particles, or all if these are fewer, as if they had these axes."""
+    """Return positions in the SLAT frame, read with `axes`, of at most 40,000 particles."""
     some = particles.positions[:: max(1, len(particles.positions) // 20_000)]
     return Particles(some, axes).in_slat()
 
@@ -186,7 +186,7 @@ def write_transferred(
 ) -> None:
     """Write the materials of particles as Pixie's PLY for PhysGaussian.
 
-    Gaussians keep their attributes, behind Pixie's fields. ``conf`` falls to 0 at `max_distance`
+    Attributes of Gaussians follow Pixie's fields. ``conf`` falls to 0 at `max_distance`
     voxels. ConfigError if another file is at `path`.
     """
     frame = FRAMES["slat" if in_slat else particles.axes]

@@ -1,7 +1,7 @@
 """The typed records that travel between the stages.
 
 Two source files become rows of the store through read, align, sample, judge, normalise and pack.
-Each stage takes the records of the one before it and returns its own; no class here touches a disk.
+Each stage takes the records of the previous one and returns its own; no class here touches a disk.
 Classes with arrays compare by identity.
 
 Frames: the *PixieVerse frame* and the *SLAT frame* are both the unit cube [-0.5, 0.5]^3 with voxel
@@ -101,9 +101,10 @@ class Annotation:
     voxel's place in that frame. ``confidence`` (N,) float32 is the probability that the class is
     right, 0 where not valid, None until judged.
 
-    A merged annotation has ``spread`` (N, P) float32, the standard deviation of each property, in
-    log10 where it is normalised so, NaN where fewer than two are valid. Its ``votes`` (N,) float32
-    are the share of valid annotations that give its class, 0 without any.
+    A merged annotation has ``spread`` (N, P) float32, the standard deviation of each property. It
+    is in log10 if the property is normalised in log10, NaN where fewer than two annotations are
+    valid. ``votes`` (N,) float32 are the share of valid annotations that give its class, 0 without
+    any.
     """
 
     properties: NDArray[np.float32]
@@ -121,20 +122,20 @@ class Contribution:
     """One of several annotations of an object, and its part in the merge."""
 
     sample: str
-    """Which it is."""
+    """Name of the annotation."""
     sources: tuple[Count, ...]
-    """Its files, by their positions among the record's sources."""
+    """Its files, as indices of the record's sources."""
     left_out: str = ""
-    """Why it is no part of the merge; empty where it is."""
+    """Why it is not merged; empty if it is."""
     alignment: Alignment | None = None
-    """The transform from its own frame; null where it could not be read."""
+    """The alignment of its own frame; null if it could not be read."""
     judgement: Judgement | None = None
-    """What that alignment is worth."""
+    """The judgement of that alignment."""
 
 
 @dataclass(frozen=True)
 class PropertyRange:
-    """How to map a property to [-1, 1].
+    """The interval of a property that is mapped to [-1, 1].
 
     ``lo`` and ``hi`` are in the mapped unit: log10 of the SI value if ``log10``, else the SI value
     itself.
@@ -151,7 +152,7 @@ class Normalization:
     """The range of every property, in the order of the columns, and the origin of the ranges.
 
     ``source`` is ``dataset``, ``p1-p99`` or other percentiles of it, ``pixie``, or the name of a
-    file. Those of the dataset may be ``of train by`` a rule of splits.
+    file. If only the training objects count, it ends in ``of train by`` and the rule of splits.
     """
 
     ranges: Annotated[tuple[PropertyRange, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
@@ -160,11 +161,11 @@ class Normalization:
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """An asset, or one of its several annotations, that went through all stages; in SI units.
+    """An asset, or one of its several annotations, after all stages, in SI units.
 
-    If merged of several annotations, it has a contribution for each. It also has the files of all,
-    with their digests by role for the asset's key, and the fields after the first. Field and
-    alignment are the first one's.
+    A merged asset has a contribution for each annotation, the files of all annotations, and their
+    digests by role for the asset's key. `field` and `alignment` are the first annotation's;
+    `others` are the fields of the further annotations.
     """
 
     pair: AssetPair

@@ -1,4 +1,4 @@
-"""The map between the frames, how it was found, and what it is worth."""
+"""Records of the map between the frames, how it was found, and its quality."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from slatprep.records.json_types import (
 from slatprep.records.tables import MAX_PROPERTIES, Engine, Model, Search, Verdict
 
 MAX_CANDIDATES = 4096
-"""Candidates and placements of one alignment; engines try a few hundred starts."""
+"""Most candidates, and most placements, of one alignment; engines try a few hundred starts."""
 
 MIRRORED = 0.025
-"""Rise of the score, once one side is mirrored, above which it is the other's mirror image.
+"""Rise of the score by mirroring one side, above which it is a mirror image of the other.
 
-Of objects that are not mirrored, on real meshes of all levels, the largest was 0.015.
+The largest rise of objects that are not mirrored was 0.015, on real meshes of all levels.
 """
 
 
@@ -34,9 +34,9 @@ Of objects that are not mirrored, on real meshes of all levels, the largest was 
 class Candidate:
     """A start orientation and how well it fitted.
 
-    ``euler_degrees`` names the start where the protocol does (x, y, z turns). ``same_as`` is the
-    index of the candidate with the same rotation whose result it shares, or None. Fitness is in
-    0..1, rmse in voxels.
+    ``euler_degrees`` are the turns about x, y and z by which the protocol names the start, or None
+    if it does not. ``same_as`` is the index of the candidate with the same rotation whose result
+    it shares, or None. Fitness is in 0..1, rmse in voxels.
     """
 
     index: Count
@@ -51,8 +51,8 @@ class Quality:
     """How well two voxel sets fit under a transform.
 
     Forward is PixieVerse boundary to SLAT, backward the reverse. Fitness is the share of voxels
-    with a partner within ``radius``, rmse the root mean square distance over those. Distances are
-    in voxels of the SLAT frame.
+    with a partner within ``radius``, rmse the root mean square distance of these voxels. Distances
+    are in voxels of the SLAT frame.
     """
 
     fitness: Share
@@ -67,7 +67,8 @@ class Quality:
 class Placement:
     """A distinct placement that fits about as well as the best one.
 
-    ``displacement`` is the largest distance [voxel] between a SLAT voxel's positions in the two.
+    ``displacement`` is the largest distance [voxel] between a SLAT voxel's positions in this
+    placement and in the best one.
     """
 
     transform: Transform
@@ -79,9 +80,9 @@ class Placement:
 class Ambiguity:
     """The effect of distinct, about equally good placements on the supervision.
 
-    ``material_share`` is the share of SLAT voxels whose class differs between any of them and the
-    best placement. ``property_change`` is the largest mean absolute change of each property, in
-    log10 where it is normalised so. All are 0 without ties.
+    ``material_share`` is the share of SLAT voxels whose class in any tied placement differs from
+    that in the best. ``property_change`` is the largest mean absolute change of each property, in
+    log10 if the property is normalised in log10. All are 0 without ties.
     """
 
     material_share: Share
@@ -92,12 +93,13 @@ class Ambiguity:
 class Judgement:
     """The quality of an alignment in words and figures; ``reasons`` say why it is not good.
 
-    ``same_object`` is the calibrated probability that both sides show the same object,
-    ``right_placement`` that the placement is right if they do, and ``confidence`` the
-    product; ``evidence`` are the figures that they rest on, `slatprep.judge.evidence.FIGURES`.
-    ``expected_accuracy`` is the share of right labels to be expected among the
-    valid ones. All are NaN in records of builds that did not tell. ``contradicted`` says
-    that the latents of the asset contradict its labels, where the two were compared.
+    ``same_object`` is the calibrated probability that both sides show the same object.
+    ``right_placement`` is the probability that the placement is right if they do, and
+    ``confidence`` is the product. ``evidence`` are the figures behind them,
+    `slatprep.judge.evidence.FIGURES`. ``expected_accuracy`` is the expected share of right labels
+    among the valid ones. All four are NaN in records of builds that did not measure them.
+    ``contradicted`` says that the asset's latents were compared with its labels and contradict
+    them.
     """
 
     ambiguity: Ambiguity
@@ -115,7 +117,7 @@ class Judgement:
 class Consensus:
     """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common.
 
-    `probability` is that of this rotation for the asset that has it by the consensus.
+    `probability` is the probability that it is right for the asset that takes it by consensus.
     """
 
     rotation: Rotation
@@ -126,21 +128,21 @@ class Consensus:
 
 @dataclass(frozen=True)
 class LatentChoice:
-    """What its latents say about an asset's tied placements.
+    """The choice that an asset's latents make among its tied placements.
 
     Attributes
     ----------
     probability : float
-        Probability that the placement taken, or one with the same labels, is the right one
-        among those tied.
+        Probability that the placement taken, or a tied one with the same labels, is the right
+        one.
     evidence : float
-        Log-likelihood ratio of the latents between its labels and the next placement's, with
-        voxels taken as independent.
+        Log-likelihood ratio of the latents between its labels and the next placement's. Voxels
+        are treated as independent.
     voxels : int
-        Voxels to which those two give different classes.
+        Number of voxels to which these two placements give different classes.
     witnesses, agreeing : int
-        Other assets that tested the latents, and those of them whose
-        latents preferred their labels to wrong ones.
+        Number of other assets that tested the latents, and of those among them whose latents
+        preferred their own labels to wrong ones.
     """
 
     probability: Share
@@ -154,15 +156,15 @@ class LatentChoice:
 class Deformation:
     """The difference between a SLAT's shape and the PixieVerse object's, beyond a similarity.
 
-    A point x of the SLAT frame belongs to ``affine @ (x, 1) + u(x)``, still in
-    the SLAT frame. From there the inverse of the alignment's transform leads to
-    the PixieVerse frame. u is a uniform cubic B-spline; lengths are in edges of
-    the unit cube. All numbers are multiples of 2^-30, which JSON holds exactly.
+    A point x of the SLAT frame is mapped to ``affine @ (x, 1) + u(x)``, still in the SLAT frame.
+    The inverse of the alignment's transform then maps it to the PixieVerse frame. u is a uniform
+    cubic B-spline; lengths are in edges of the unit cube. All numbers are multiples of 2^-30,
+    which JSON holds exactly.
 
     Attributes
     ----------
     affine : ndarray of float64, shape (3, 4)
-        The smooth part of the map without bending.
+        The affine part of the map.
     origin : ndarray of float64, shape (3,)
         Lower corner of the splines' domain; control point (1, 1, 1) lies there.
     spacing : float
@@ -209,10 +211,10 @@ class Agreement:
     Attributes
     ----------
     directions_near, directions_middle : float
-        How far apart the nearest 30 % and the nearer half of the samples lie, by direction
-        of their normals (26 of a cube): mean over directions.
+        Distance within which 30 % and 50 % of the samples lie, measured for each direction of
+        their normals (26 of a cube): mean over directions.
     directions_worst : float
-        The 30 % of the direction that is worst but one.
+        Distance for 30 % of the samples, in the second-worst direction.
     blocks_near, blocks_middle, blocks_far : float
         Share of the samples in blocks of 8 voxels whose median is within 0.5, 1 and 1.5 voxels.
     within_slat, within_pixieverse : tuple of float
@@ -231,7 +233,7 @@ class Agreement:
 
 @dataclass(frozen=True)
 class FitFigures:
-    """What the default engine measured of its own fit; the verdict uses it.
+    """Measurements of the default engine about its own fit, which the verdict uses.
 
     Scores are means of 1 / (1 + r^2), r the residual in voxels, over samples
     not used in the fit. A perfect fit has 1; an error of a voxel everywhere gives 0.5.
@@ -241,18 +243,16 @@ class FitFigures:
     score_slat, score_pixieverse : float
         Score over the samples of either side, under the final map.
     score_similarity : float
-        Score over the samples of both sides together under the transform alone; where another
-        engine placed it, the mean of both sides' scores.
+        Score over the samples of both sides together under the transform alone; the mean of both
+        sides' scores if another engine found the transform.
     evidence_affine, evidence_deformable : float
-        Rise of the score, in blocks of space that a trial fit had not seen, by
-        an affine map, and by a coarse deformation after it; NaN if no trial
-        was needed.
+        Rise of the score by an affine map, and by a coarse deformation after it, in blocks of
+        space that were not used in a trial fit; NaN if no trial was needed.
     within : tuple of float
         Shares of the samples of both sides with a residual within 1, 2 and 3
         voxels, under the final map.
     offset : float
-        Distance [voxel] of the PixieVerse surface inside the SLAT's
-        (negative: it is thicker).
+        Depth [voxel] of the PixieVerse surface inside the SLAT's; negative if it lies outside.
     roughness : float
         Median absolute residual [voxel] under the final map.
     moved, moved_most : float
@@ -264,15 +264,14 @@ class FitFigures:
         Root mean square second derivative of the displacement over the
         lattice [1 / voxel]; 0 without one.
     mirrored : float
-        Rise of the score once one side is mirrored: above 0.025 the annotation is a
-        mirror image of its object. NaN where the fit is too good for that, or where
-        another engine placed it.
+        Rise of the score by mirroring one side: above 0.025 the annotation is a mirror image of
+        its object. NaN if the fit is too good for that, or if another engine found the transform.
     clear_by : float
-        By how many standard errors it fits better, on the same samples, than any placement that
-        scores less than 0.03 below it (0.06 where it is contested); NaN where there is none, or
-        where another engine placed it.
+        Lead over the next placement, in standard errors on the same samples. Compared are
+        placements that score less than 0.03 below it (0.06 if it is contested). NaN if there is
+        none, or if another engine found the transform.
     agreement : Agreement or None
-        How evenly the surfaces lie on each other; None where it was not measured.
+        How evenly the surfaces lie on each other; None if it was not measured.
     """
 
     score_slat: float
@@ -301,7 +300,8 @@ class Ground:
     normal : ndarray of float64, shape (3,)
         Unit vector of the PixieVerse frame, from the ground to the object.
     height : float
-        Of the ground's top along the normal, from the frame's centre, in edges of the unit cube.
+        Height of the ground's top along the normal, from the frame's centre, in edges of the
+        unit cube.
     """
 
     normal: Point
@@ -333,13 +333,13 @@ class Alignment:
     score : float
         The engine's rank of placements, 1 for a perfect fit; NaN if it ranks by fitness alone.
     settled_by : Consensus, LatentChoice or None
-        What chose among tied placements, the dataset's common rotation or the latents, with
+        The dataset's common rotation or the latents, if either chose among tied placements, with
         the probability of the choice.
     deformation : Deformation or None
-        On the way from the SLAT frame to the PixieVerse frame it comes before the inverse of
-        `transform`; None if the model is ``rigid`` or ``similarity``.
+        Map that is applied to points of the SLAT frame before the inverse of `transform`; None if
+        the model is ``rigid`` or ``similarity``.
     figures : FitFigures or None
-        What the engine measured of its fit, if anything.
+        Measurements of the engine about its fit, if it made any.
     ground : Ground or None
         The part of the annotation that was not compared with the SLAT, if any.
     """

@@ -1,9 +1,9 @@
-"""The encoders whose latents slatprep knows, with the moments that are published of them.
+"""The encoders whose latents slatprep knows, with their published moments.
 
-TRELLIS.2's are from microsoft/TRELLIS.2 (MIT license), where they stand with its flow models:
+TRELLIS.2's moments are from microsoft/TRELLIS.2 (MIT license), in the files of its flow models:
 ``configs/gen/slat_flow_img2shape_dit_1_3B_512_bf16.json``, ``normalization``, and
-``configs/gen/slat_flow_imgshape2tex_dit_1_3B_512_bf16.json``, ``pbr_slat_normalization``. Those of
-resolution 1024 (``..._ft1024.json``) are the same.
+``configs/gen/slat_flow_imgshape2tex_dit_1_3B_512_bf16.json``, ``pbr_slat_normalization``. The files
+of resolution 1024 (``..._ft1024.json``) have the same moments.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ LATENTS = {one.encoder: one for one in (TRELLIS, replace(TRELLIS, encoder="sam3d
 
 for _name, _mean, _std in (
     ("trellis2", SHAPE_MEAN, SHAPE_STD),
-    # Shape latents with the texture latents of the same voxels behind.
+    # Shape latents, followed by the texture latents of the same voxels.
     ("trellis2-shape-pbr", SHAPE_MEAN + PBR_MEAN, SHAPE_STD + PBR_STD),
     ("trellis2-pbr", PBR_MEAN, PBR_STD),
 ):
-    # Of objects at 1024^3, and at 512^3: the grid of latents is a sixteenth as fine.
+    # For objects at 1024^3 and at 512^3; the latents' grid has a sixteenth of these sides.
     for _size, _side in (("", 64), ("-512", 32)):
         LATENTS[_name + _size] = LatentSpace(_name + _size, len(_mean), _side, _mean, _std)

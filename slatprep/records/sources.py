@@ -1,4 +1,4 @@
-"""Where the two sides of a pair lie, and what is read from them."""
+"""Records of where the two sides of a pair lie, and of the data read from them."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ class Place(Protocol):
         """Return the place of this name below it."""
 
     def absolute(self) -> Self:
-        """Return it independent of the working folder."""
+        """Return it as an absolute place."""
 
     def exists(self) -> bool:
-        """Whether it is a file or a folder."""
+        """Return whether it is a file or a folder."""
 
     def is_dir(self) -> bool:
-        """Whether it is a folder."""
+        """Return whether it is a folder."""
 
     def is_file(self) -> bool:
-        """Whether it is a file."""
+        """Return whether it is a file."""
 
     def open(
         self, mode: str, *, encoding: str | None = None, newline: str | None = None
@@ -75,7 +75,7 @@ ROLES = ("grid", "mask", "bounds", "description", "transform", "slat", "texture"
 """The roles of a file in its asset."""
 
 LATENT_ROLES = ("slat", "texture")
-"""Those whose root is that of the latents."""
+"""Roles of files below the root of the latents."""
 
 
 @dataclass(frozen=True)
@@ -94,19 +94,19 @@ class SourceFile:
 
 
 Plausibility = Literal["refuse", "warn", "off"]
-"""What becomes of values that no material has, see `slatprep.readers.plausible`."""
+"""The treatment of values that no material has, see `slatprep.readers.plausible`."""
 
 LOG10 = "log10 "
-"""What a unit begins with where a file holds the logarithm of the value."""
+"""Prefix of a unit if the file holds the logarithm of the value."""
 
 FACTORS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "kg/m^3": 1.0, "g/cm^3": 1e3}
-"""What a value in a unit is multiplied by to be in SI units."""
+"""Factor by which a value in a unit is multiplied to be in SI units."""
 
 _FACTOR = {"": 1.0, "1": 1.0} | FACTORS
 
 
 def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
-    """Return values of any shape in SI units; those of unit ``1``, or of none, stay as they are."""
+    """Return values of any shape in SI units; unchanged if the unit is ``1`` or empty."""
     given = np.asarray(values, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         si = 10.0**given if unit.startswith(LOG10) else given * _FACTOR[unit]
@@ -115,9 +115,9 @@ def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Units:
-    """Units of the values in the files of a source; empty where nobody stated them.
+    """Units of the values in the files of a source; empty if they are not stated.
 
-    What is stated is not asked about.
+    Checks whether values look like another unit's skip a property whose unit is stated.
     """
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
@@ -126,7 +126,7 @@ class Units:
     density: Literal["", "kg/m^3", "g/cm^3", "log10 kg/m^3"] = ""
 
     def of(self, name: str) -> str:
-        """Return the stated unit of a property; empty where there is none."""
+        """Return the stated unit of a property; empty if there is none."""
         return str(getattr(self, name, ""))
 
 
@@ -135,7 +135,8 @@ class SourceRoots:
     """The root folders of a source and of the latents, and what they hold.
 
     ``number`` is the source's index from 0; the first one names the others in ``also``.
-    ``units`` are those of its files; ``plausibility`` decides about values that no material has.
+    ``units`` are the units of its files; ``plausibility`` is the treatment of values that no
+    material has.
     """
 
     pixieverse: Place
@@ -228,9 +229,9 @@ class MaterialField:
     material : ndarray of uint8, shape (K,)
         Class of each annotated voxel, an index of `Contents.labels`.
     properties : ndarray of float32, shape (K, P)
-        Properties of each in SI units, a column for each of `table`.
+        Properties of each annotated voxel in SI units, a column for each of `table`.
     unphysical : int
-        Voxels with a class that are not annotated, as no material has their properties.
+        Number of voxels with a class that are not annotated, as no material has their properties.
     bounds : dict or None
         World bounds as ``clip_features.npz`` states them, JSON-ready.
     sources : tuple of SourceFile
@@ -240,7 +241,7 @@ class MaterialField:
     table : tuple of Property
         The columns of `properties`.
     frame : ndarray of float64, shape (4, 4), or None
-        Its frame in the SLAT's, if the source states it.
+        Transform from its frame to the SLAT frame, if the source states it.
     classified : bool
         Whether the source has classes; without them `material` is 0 throughout.
     """
@@ -264,13 +265,13 @@ _ODDITY = re.compile(r"unusual (values|masks|places|latents): (.+)", re.DOTALL)
 def oddity(kind: str, text: str) -> str:
     """Return a warning of unusual ``values``, ``masks``, ``places`` or ``latents`` of a source.
 
-    A build prints it, and `slatprep info` and `slatprep list` tell it again.
+    A build prints it, and `slatprep info` and `slatprep list` repeat it.
     """
     return f"unusual {kind}: {text}"
 
 
 def oddities_in(warnings: Iterable[str]) -> dict[str, str]:
-    """Return the first text of each kind that `oddity` told, in one line, sorted by kind."""
+    """Return the first text of each kind of `oddity` among warnings, in one line, by kind."""
     found = [match for one in warnings if (match := _ODDITY.search(one))]
     return dict(sorted({match[1]: " ".join(match[2].split()) for match in reversed(found)}.items()))
 
@@ -280,7 +281,7 @@ class StructuredLatents:
     """A SLAT: occupied surface voxels and their latents.
 
     ``coords`` is (N, 3) uint8 in 0..resolution - 1 in the order of the source file, ``feats`` is
-    (N, channels) float32. ``standardised`` says whether these are standardised already.
+    (N, channels) float32. ``standardised`` says whether `feats` are standardised already.
     ``resolution`` is the number of the encoder's voxels along each axis of the unit cube, 64 in the
     frame.
     """

@@ -1,7 +1,7 @@
-"""The words that all records share, and what a dataset holds.
+"""Names and constants that all records share, and the contents of a dataset.
 
-Words are classes, colours, engines and verdicts; a dataset holds properties, classes, and the
-latents beside them.
+Names are those of classes, colours, engines and verdicts. The contents are properties, classes and
+latents.
 """
 
 from __future__ import annotations
@@ -57,10 +57,9 @@ CLASS_COLOURS = {
 }
 """Colour of each of PhysGaussian's material classes, by name, in the order of their ids.
 
-They stay apart for people who do not tell red from green, or blue from green:
-simulated after Machado, Oliveira and Fernandes ("A Physiologically-based Model
-for Simulation of Color Vision Deficiency", IEEE TVCG 2009), any two of them
-differ by more than 20 in CIELAB.
+People who do not tell red from green, or blue from green, can tell them apart. Simulated after
+Machado, Oliveira and Fernandes ("A Physiologically-based Model for Simulation of Color Vision
+Deficiency", IEEE TVCG 2009), any two colours differ by more than 20 in CIELAB.
 """
 
 MATERIAL_CLASSES = tuple(CLASS_COLOURS)
@@ -71,11 +70,11 @@ UNANNOTATED_COLOUR = "#FFFFFF"
 
 
 INK, MUTED = "#1F2328", "#6B7280"
-"""Colours of pictures: of text and data, and of what is only beside them."""
+"""Colours of pictures: text and data, and everything secondary."""
 
 
 def _colour_beyond(index: int) -> str:
-    """Return a colour for a class beyond PhysGaussian's, unlike those before it."""
+    """Return a colour for a class beyond PhysGaussian's, unlike the colours of lower ids."""
     # Steps of the golden ratio cover all hues and never repeat one.
     hue, lightness = index * 0.618034 % 1.0, (0.35, 0.5, 0.65)[index % 3]
     return "#" + "".join(f"{round(255 * c):02X}" for c in hls_to_rgb(hue, lightness, 0.6))
@@ -86,7 +85,7 @@ MATERIAL_COLOURS = {
     **{index: _colour_beyond(index) for index in range(len(MATERIAL_CLASSES), MANY_BACKGROUND)},
     UNANNOTATED: UNANNOTATED_COLOUR,
 }
-"""The same by material id, as the store holds it; of more classes, the others' from 8 on."""
+"""Colour by material id, as the store holds it; ids from 8 on occur if there are more classes."""
 
 COLOURS = np.zeros((256, 3), dtype=np.uint8)
 """Red, green and blue of every material id."""
@@ -97,7 +96,7 @@ _Words = TypeVar("_Words", bound=Iterable[object])
 
 
 def words_of(given: _Words) -> _Words | tuple[str]:
-    """Return words of which one alone may be given as a text."""
+    """Return words as they are, and a single word that is given as a text as a tuple."""
     return (given,) if isinstance(given, str) else given
 
 
@@ -136,7 +135,7 @@ class Verdict(StrEnum):
 
 
 USABLE = (Verdict.GOOD, Verdict.DOUBTFUL)
-"""Verdicts of assets that go into trainings and exports unless others are asked for."""
+"""Verdicts of assets that trainings and exports take by default."""
 
 
 class Status(StrEnum):
@@ -158,10 +157,10 @@ PropertyName = Annotated[str, InJson({"type": "str", "pattern": r"^[a-z][a-z0-9_
 
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_ -]{0,63}")
 ClassName = Annotated[str, InJson({"type": "str", "pattern": f"^{CLASS_NAME.pattern}$"})]
-"""Name of a class: as that of a property, and blanks and ``-``."""
+"""Name of a class: like a property's name, also with blanks and ``-``."""
 
 _TITLES = {"youngs_modulus": "Young's modulus", "poissons_ratio": "Poisson's ratio"}
-"""Names in plain English that are not the column's name with blanks."""
+"""Names in plain English, if they are not the column's name with blanks."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,7 @@ class Property:
     unit : str
         SI unit of its values; ``1`` if it has none.
     log10 : bool
-        Whether its log10 is normalised, so that it must be above 0, or the value itself.
+        Whether its log10 is normalised, so that values must be above 0, or the value itself.
     least, most : float
         Values that a material can have, ends included. Readers of sources need them; a store
         does not keep them.
@@ -201,12 +200,12 @@ class Property:
 
     @property
     def sign(self) -> str:
-        """Its unit as figures show it; empty where it has none."""
+        """Its unit as figures show it; empty if it has none."""
         return "" if self.unit == "1" else self.unit.replace("^2", "²").replace("^3", "³")
 
     @property
     def allowed(self) -> str:
-        """What its values may be, in words."""
+        """Its allowed values, in words."""
         bounds = f" in [{self.least:g}, {self.most:g}]" if np.isfinite(self.most) else ""
         above = " above 0" if self.log10 else ""
         return f"a finite {self.title}{above}{bounds}" + (
@@ -219,10 +218,10 @@ PROPERTIES = (
     Property("density", "kg/m^3", True),
     Property("poissons_ratio", "1", False, 0.0, 0.5),
 )
-"""The three that PixieVerse annotates."""
+"""The three properties that PixieVerse annotates."""
 
 PROPERTY_COLUMNS = tuple(one.name for one in PROPERTIES)
-"""Their names, in the order that all tables of PixieVerse have."""
+"""Their names, in the order of the columns of slatprep's tables."""
 
 
 @dataclass(frozen=True)
@@ -246,8 +245,8 @@ class LatentSpace:
     resolution : int
         Voxels along each axis of its grid.
     mean, std : tuple of float
-        Of each channel before standardisation; empty if unpublished, so that a build measures
-        its dataset's.
+        Moments of each channel before standardisation. If they are empty, as unpublished, a build
+        measures its dataset's.
     standardised : bool
         Whether the latents, as stored, are standardised already.
     """
@@ -266,18 +265,18 @@ class LatentSpace:
 
     @property
     def beside_voxels(self) -> dict[str, NDArray[np.int64]]:
-        """What an npz says beside its voxels: their ``resolution``, unless it is the frames'."""
+        """Entries of an npz beside its voxels: their ``resolution``, unless it is the frames'."""
         return {} if self.resolution == RESOLUTION else {"resolution": np.array(self.resolution)}
 
     def standardise(self, feats: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return latents (N, channels) with mean 0 and standard deviation 1; done once."""
+        """Return latents (N, channels) standardised; unchanged if they are already."""
         if self.standardised:
             return feats
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
         return np.asarray((feats - mean) / std)
 
     def as_encoded(self, feats: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return latents (N, channels) as the encoder gives them, where its moments are known."""
+        """Return latents (N, channels) as the encoder gives them, if its moments are known."""
         if not self.standardised or not self.mean:
             return feats
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
@@ -291,7 +290,7 @@ TRELLIS = LatentSpace("trellis", 8, RESOLUTION, FEATS_MEAN, FEATS_STD)
 def labels_of(classes: tuple[str, ...]) -> tuple[str, ...]:
     """Return the classes that a voxel may have, by id: for PhysGaussian's, all but the background.
 
-    ValueError if a store cannot tell so many apart, or their names are not unique.
+    ValueError if a store cannot hold so many, their names are not unique, or one is background.
     """
     if classes == MATERIAL_CLASSES:
         return classes[:BACKGROUND]
@@ -304,7 +303,7 @@ def labels_of(classes: tuple[str, ...]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a dataset holds; without classes, every annotated voxel is of class 0."""
+    """Contents of a dataset; without classes, every annotated voxel is of class 0."""
 
     properties: tuple[Property, ...] = PROPERTIES
     classes: tuple[str, ...] = MATERIAL_CLASSES

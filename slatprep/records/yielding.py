@@ -1,4 +1,4 @@
-"""Where materials stop being elastic: assumptions for each class, since no source states them."""
+"""Limits of elasticity, assumed for each class, since no source states them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NEVER = 1.0e15
 
 
 class Yielding(NamedTuple):
-    """Where a material stops being elastic; PixieVerse has no such properties.
+    """Limits at which a material stops being elastic; PixieVerse has no such properties.
 
     Attributes
     ----------
