@@ -1,1 +1,1 @@
-"""Where bytes lie: local disks and object stores, and how a result takes its place in one step."""
+"""Storage on local disks and object stores, where a result replaces an older one in one step."""

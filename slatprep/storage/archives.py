@@ -1,9 +1,9 @@
-"""Archives read as the folder that they were made of, without unpacking them.
+"""Read archives like the folder from which they were made, without unpacking them.
 
-A `members.ArchivePlace` is a file of the tree that several of them make up. Of an uncompressed
-archive only headers are read, and the members that are asked for; where they lie is kept in the
-cache for as long as the archive is the same. Of one with gzip, and of any on an object store,
-members are kept as well: they come from there but once.
+A `members.ArchivePlace` is a file of the tree that several archives make up. From an uncompressed
+archive only headers and requested members are read. The cache keeps the index of members as long as
+the archive is the same. For gzip archives, and archives on an object store, it keeps the members
+too, so that each is read from there only once.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 SUFFIXES = (".tar", ".tar.gz", ".tgz")
-"""How the names of archives end."""
+"""Endings of the names of archives."""
 
 _FORMAT, _INDEX = 3, "index.z"
 
 _COMMIT = re.compile(r"(?<=[^/])@[0-9a-f]{40}(?=/|$)")
 _SAVE_S = 20.0
-"""How often an index that is being made is written down, so that a killed build loses little."""
+"""Interval [s] at which an unfinished index is saved, so that a killed build loses little."""
 
 
 def is_archive(name: str) -> bool:
-    """Whether a file is an archive by its name."""
+    """Return whether a file is an archive, by its name."""
     return name.lower().endswith(SUFFIXES)
 
 
 @dataclass(frozen=True)
 class Archive:
-    """An archive as it was when it was looked at; on the hub, at one commit.
+    """An archive in the state in which it was found; on the hub, at one commit.
 
-    Its `stamp` tells it from one that lay there before, or will later; it is `trusted` if a later
-    change is sure to change that. `size` is in bytes. `wanted` are patterns of the members that may
-    be asked for, see `is_wanted`.
+    `stamp` distinguishes it from earlier and later archives at the same place. The archive is
+    `trusted` if any later change is sure to change the stamp. `size` is in bytes. `wanted` are
+    patterns of the members that may be requested, see `is_wanted`.
     """
 
     place: Place
@@ -64,9 +64,9 @@ class Archive:
 
     @classmethod
     def on_disk(cls, path: Path, wanted: tuple[str, ...]) -> Archive:
-        """Look at an archive on the disk; OSError if that cannot be."""
+        """Return an archive on the disk; OSError if it cannot be read."""
         with open_regular(path) as file:
-            # Of one with gzip the members are kept, so that its digest is worth its time.
+            # The members of a gzip archive are kept, so its digest is worth its time.
             packed = _is_packed(path.name)
             more = lasting_state(file.fileno()) or (open_digest(file) if packed else "")
             stamp = f"{_stamp_of(file)};{boot_id()} {more}"
@@ -76,43 +76,43 @@ class Archive:
     def of_object(
         cls, place: RemotePlace, entry: Mapping[str, Any], wanted: tuple[str, ...]
     ) -> Archive:
-        """Take an archive as the listing of an object store has it."""
+        """Return an archive from the listing of an object store."""
         return cls(place, stamp_of(entry), int(entry["size"]), True, wanted)
 
     @property
     def packed(self) -> bool:
-        """Whether it is compressed, so that it can only be read from its beginning."""
+        """Whether the archive is compressed, so that it can only be read from its beginning."""
         return _is_packed(self.place.name)
 
     @property
     def keeps(self) -> bool:
-        """Whether its members are kept in the cache."""
+        """Whether the cache keeps the archive's members."""
         return self.packed or isinstance(self.place, RemotePlace)
 
     @property
     def folder(self) -> Path:
-        """The folder of the cache that belongs to it as it is."""
+        """Folder of the cache for the archive in this state."""
         state = [self.stamp, *(self.wanted if self.packed else ())]
         return self.home / short(" ".join(state))
 
     @property
     def home(self) -> Path:
-        """The folder of the cache for whatever lies at its place."""
+        """Folder of the cache for any archive at this place."""
         return cache_folder() / f"{self.place.name}-{short(shown(self.place))}"
 
     def is_wanted(self, name: str) -> bool:
-        """Whether a member may be asked for, by its name."""
+        """Return whether a member may be requested, by its name."""
         return any(_like(pattern).fullmatch(name) for pattern in self.wanted)
 
     def may_hold(self, folder: str) -> bool:
-        """Whether a member may be asked for that lies in a folder, or below it."""
+        """Return whether a folder, or a folder below it, may have a wanted member."""
         depth = folder.count("/") + 1
         parts = (pattern.split("/") for pattern in self.wanted)
         heads = ("/".join(one[:depth]) for one in parts if len(one) > depth)
         return not folder or any(_like(head).fullmatch(folder) for head in heads)
 
     def read(self, entry: Entry) -> bytes:
-        """Read a member; InputError if the archive is not the one that was looked at."""
+        """Read a member; InputError if the archive was replaced."""
         data = self._kept(entry) if self.keeps else None
         if data is None and self.packed:
             _extend(self, Index())
@@ -126,14 +126,14 @@ class Archive:
         return data
 
     def checked(self, entry: Entry, data: bytes) -> bytes:
-        """Return the data of a member, given with the header in front of it."""
+        """Return the data of a member from its header and data; InputError as `read`."""
         if zlib.crc32(data[:BLOCK]) != entry.check:
             (self.folder / _INDEX).unlink(missing_ok=True)
             raise self.replaced()
         return data[BLOCK:]
 
     def range(self, length: int, offset: int) -> bytes:
-        """Read a range; see `read`."""
+        """Read a range of bytes; InputError as `read`."""
         with self.open_ranges() as file:
             data = file.pread(length, offset)
         if len(data) != length:
@@ -141,7 +141,7 @@ class Archive:
         return data
 
     def open_ranges(self) -> LocalFile | RemoteFile:
-        """Open it for reading by ranges; see `read`."""
+        """Open the archive for reading by ranges; InputError as `read`."""
         if isinstance(self.place, RemotePlace):
             return RemoteFile(self.place, self.size)
         file = open_regular(Path(str(self.place)))
@@ -151,19 +151,19 @@ class Archive:
         return file
 
     def replaced(self) -> InputError:
-        """Return the error that says that it is another archive by now."""
+        """Return the error for an archive that was replaced."""
         return InputError(
             shown(self.place), "was replaced after it was looked at", "the same archive; run again"
         )
 
     def keep(self, entry: Entry, data: bytes) -> None:
-        """Keep a member in the cache."""
+        """Write a member into the cache."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with staged_apart(self._file(entry), self.folder) as partial:
             partial.write_bytes(zlib.compress(data, 1))
 
     def holds(self, entry: Entry) -> bool:
-        """Whether a member need not be fetched."""
+        """Return whether a member need not be fetched."""
         return not self.keeps or self._file(entry).exists()
 
     def _kept(self, entry: Entry) -> bytes | None:
@@ -177,10 +177,10 @@ class Archive:
         return self.folder / f"{short(entry.link or entry.name)}.z"
 
     def index(self, progress: Callable[[int], None] = lambda _: None) -> Index:
-        """Return where its members lie, from the cache or by reading its headers.
+        """Return the index of the archive, from the cache or by reading the headers.
 
-        `progress` is called with the bytes that were passed. OSError if it cannot be read: what
-        was found by then is kept.
+        `progress` is called with the number of bytes that were scanned. OSError if the archive
+        cannot be read; the members found by then are kept.
         """
         index = _read_index(self)
         if not index.complete:
@@ -192,10 +192,10 @@ class Archive:
 class Index:
     """The members of an archive by name, as far as it was read.
 
-    A name that occurs `twice` stands for the last, as in unpacking. `next` is where the next header
-    begins, `complete` whether there are no more, `fault` why no more can be read. `strange` are
-    names of members that lead out of the archive. It has all members that match `wanted`, or all
-    without.
+    `twice` counts names that occur again; their last member counts, as in unpacking. `next` is the
+    offset of the next header, `complete` says that there is none, and `fault` why no more can be
+    read. `strange` are names of members that lead out of the archive. All members that match
+    `wanted` are there, or all members if it is empty.
     """
 
     members: dict[str, Entry] = field(default_factory=dict)
@@ -207,7 +207,7 @@ class Index:
     wanted: list[str] = field(default_factory=list)
 
     def told(self) -> str:
-        """Return what a user should know of it; empty if nothing."""
+        """Return what a user should know about the archive; empty if there is nothing."""
         lines = []
         if self.twice:
             names = "names occur" if self.twice > 1 else "name occurs"
@@ -236,7 +236,7 @@ class Index:
 def _extend(
     archive: Archive, index: Index, progress: Callable[[int], None] = lambda _: None
 ) -> None:
-    """Read the rest of an archive's headers; what was found is kept, however that ends."""
+    """Read the rest of an archive's headers; keep the members found, even after an error."""
     archive.folder.mkdir(parents=True, exist_ok=True)
     saved, remote = time.monotonic(), isinstance(archive.place, RemotePlace)
     index.wanted = list(archive.wanted) if remote else []
@@ -273,7 +273,7 @@ def _write_index(archive: Archive, index: Index) -> None:
 
 
 def _read_index(archive: Archive) -> Index:
-    """Return what is known of an archive's members."""
+    """Return the index of an archive from the cache, or an empty index."""
     try:
         document = orjson.loads(zlib.decompress((archive.folder / _INDEX).read_bytes()))
         index = Index(**document["index"])
@@ -282,17 +282,17 @@ def _read_index(archive: Archive) -> Index:
             return index
     except (OSError, ValueError, TypeError, LookupError, AttributeError, zlib.error):
         pass
-    return Index()  # It is made anew.
+    return Index()  # The caller makes it anew.
 
 
 def shown(place: Place) -> str:
-    """Return what to call a place: of the hub without the commit."""
+    """Return the name of a place for messages, without a commit of the hub."""
     return _COMMIT.sub("", str(place))
 
 
 @lru_cache(maxsize=64)
 def _like(pattern: str) -> re.Pattern[str]:
-    """Return the expression of a pattern, whose ``*`` stands for anything within a component."""
+    """Return a pattern as an expression; ``*`` matches anything within a component of a name."""
     return re.compile("[^/]*".join(re.escape(part) for part in pattern.split("*")), re.DOTALL)
 
 

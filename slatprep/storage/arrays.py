@@ -1,6 +1,6 @@
-"""Files of arrays: each with its checksum, in a third of npz's time; and points as PLY.
+"""Files of arrays, each array with a checksum, in a third of npz's time; and points as PLY.
 
-The file of arrays has a mark, the header's length and its CRC32C, the header as JSON, then the
+A file of arrays has a mark, the header's length and its CRC32C, the header as JSON, then the
 arrays in C order.
 """
 
@@ -27,7 +27,7 @@ _MOST_AXES, _MOST_BYTES = 8, 2**40
 
 
 def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays of numbers, bool or text by name; OSError if the disk refuses."""
+    """Write arrays of numbers, bool or text by name; OSError if they cannot be written."""
     entries, parts, at = {}, [], 0
     for name, array in arrays.items():
         data = np.asarray(array, order="C").reshape(-1).view(np.uint8)
@@ -42,8 +42,8 @@ def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
 class ArrayFile(Mapping[str, NDArray[Any]]):
     """The arrays of a file that `write_arrays` wrote; each access reads from the file anew.
 
-    The file must allow random access. StoreError if it is no such file or its header is damaged,
-    and later if an array is.
+    The file must allow random access. StoreError if it is no file of arrays or its header is
+    damaged, and on access if the array is damaged.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -73,7 +73,7 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
 
 
 def _entries_in(header: bytes, size: int) -> dict[str, Any]:
-    """Return the header's entry for each array; all must fit into so many bytes after it."""
+    """Return the header's entry of each array; StoreError unless all fit into `size` bytes."""
     try:
         entries = orjson.loads(header)
     except ValueError:
@@ -84,12 +84,12 @@ def _entries_in(header: bytes, size: int) -> dict[str, Any]:
 
 
 def _lies_in(size: int, entry: Any) -> bool:
-    """Whether an entry describes an array of numbers, bool or text within so many bytes."""
+    """Return whether an entry describes an array of numbers, bool or text within `size` bytes."""
     match entry:
         case [str(dtype), list(shape), int(at), int()] if _TYPES.fullmatch(dtype):
             lengths = [length for length in shape if isinstance(length, int) and length >= 0]
             item = np.dtype(dtype).itemsize
-            # An array without elements may name a length that numpy refuses nevertheless.
+            # Even an array without elements may have a length that numpy refuses.
             fits = item * math.prod(length or 1 for length in lengths) <= _MOST_BYTES
             whole = len(lengths) == len(shape) <= _MOST_AXES
             return whole and fits and 0 <= at <= size - item * math.prod(lengths)

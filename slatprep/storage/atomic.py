@@ -1,8 +1,8 @@
-"""Write what readers and other processes must never see half done: exchanges, stages, locks.
+"""Write files and directories that nobody may see half done: exchange, stage, lock.
 
-A new directory takes the place of an old one in one step where the system can, after all of it is
-on the disk. After a power failure, either the old one or the new one is there and complete. A lock
-ends with its holder, however that ends.
+A new directory replaces an old one in one step if the system can do that, after all of it is on the
+disk. After a power failure, either the old one or the new one is there and complete. A lock ends
+with its holder, however the holder ends.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _RENAME_EXCHANGE = 2
 
 
 def replace_directory(new: Path, target: Path) -> None:
-    """Move the directory `new` to `target`, then remove the old one; both on one file system.
+    """Move the directory `new` to `target` on the same file system, then remove the old one.
 
     On Linux one system call exchanges them, so a reader finds the old or the new one complete at
     every moment. Elsewhere, two renames leave a short moment without either; `restore_directory`
-    repairs a kill in it. OSError if the move fails; `target` is then unchanged.
+    repairs a kill at that moment. OSError if the move fails; `target` is then unchanged.
     """
     flush_tree(new)
     reached("directory flushed", str(target))
@@ -58,11 +58,11 @@ def replace_directory(new: Path, target: Path) -> None:
     flush(target.parent)
     reached("directory exchanged", str(target))
     if old.exists():
-        shutil.rmtree(old, ignore_errors=True)  # The work folder goes next, with what is left.
+        shutil.rmtree(old, ignore_errors=True)  # The caller removes the work folder with any rest.
 
 
 def restore_directory(work: Path, target: Path) -> None:
-    """Restore what a kill between the two renames of `replace_directory` left below `work`."""
+    """Restore `target` from below `work` after a kill between `replace_directory`'s renames."""
     for scratch in sorted(work.glob("*")):
         if _aside(scratch).exists() and not target.exists():
             _aside(scratch).rename(target)
@@ -79,7 +79,7 @@ def flush_tree(directory: Path) -> None:
 def flush(path: Path) -> None:
     """Flush a file's content, or a directory's names, to the disk."""
     if path.is_dir() and sys.platform == "win32":
-        return  # There a directory cannot be opened.
+        return  # Windows cannot open a directory.
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -92,7 +92,7 @@ def _aside(scratch: Path) -> Path:
 
 
 def _exchange(new: Path, target: Path) -> bool:
-    """Exchange two directories atomically; False where the system cannot."""
+    """Exchange two directories atomically; return False if the system cannot."""
     if sys.platform != "linux":
         return False
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
@@ -108,8 +108,8 @@ def _exchange(new: Path, target: Path) -> bool:
 def staged(path: Path) -> Iterator[Path]:
     """Yield a file beside `path` that replaces it, complete and on disk, unless an error occurs.
 
-    Its name is always the same, so the next process replaces what a killed one left. If a link,
-    another user's file or a running process's file has that name, another name is used.
+    Its name is always the same, so the next process reuses the file that a killed process left. If
+    a link, another user's file or a running process's file has that name, another name is used.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary, held = _claimed(path)
@@ -144,9 +144,9 @@ def _claimed(path: Path) -> tuple[Path, int]:
 def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
     """Yield a file in `folder` that replaces `path`, complete, unless an error occurs.
 
-    Unlike with `staged` it is not flushed, and its name is new each time: a worker that outlives a
-    killed build, or that a cluster has given up, may write the same file. Folders are not created,
-    because such a worker must not bring back removed ones.
+    Unlike in `staged`, the file is not flushed. Its name is new each time, because a worker that
+    outlives a killed build, or that a cluster has given up, may write the same file. Folders are
+    not created, because such a worker must not bring back removed folders.
     """
     temporary = folder / f"{secrets.token_hex(16)}.partial"
     try:
@@ -171,16 +171,16 @@ def writing(what: str, where: Place) -> Iterator[None]:
 
 
 _TRIES = 100
-"""Attempts to lock a file that its holder has just removed."""
+"""Number of attempts to lock a file that its holder removes meanwhile."""
 
 
 def take_lock(path: Path, taken: str) -> int:
     """Return a descriptor that holds a lock until it is closed or the process ends.
 
     The file and its folder are created; the holder may remove the file. StoreError if another
-    process holds it, with that process and the words of `taken`, such as ``STORE: another build is
-    writing it``; also if the file is no lock, or its folder vanishes. OSError if it cannot be
-    written, or is a link.
+    process holds the lock: its text is `taken`, such as ``STORE: another build is writing it``,
+    with that process. StoreError also if the file is no lock, or its folder vanishes. OSError if
+    the file cannot be written, or is a link.
     """
     if sys.platform == "win32":
         raise StoreError(
@@ -201,7 +201,7 @@ def take_lock(path: Path, taken: str) -> int:
                     f"{taken} ({who}); wait until it has ended, or choose another path"
                 )
             if not is_at(descriptor, path):
-                continue  # What we locked has been removed; lock what is there now.
+                continue  # The locked file has been removed; lock the file that is there now.
             _sign(descriptor, path)
             unless_held.pop_all()
             return descriptor
@@ -212,7 +212,7 @@ def take_lock(path: Path, taken: str) -> int:
 
 
 def _sign(descriptor: int, path: Path) -> None:
-    """Write into a lock which process holds it."""
+    """Write this process into a lock as its holder."""
     state = os.fstat(descriptor)
     if not stat.S_ISREG(state.st_mode) or (state.st_size and not _holder(descriptor)):
         raise StoreError(

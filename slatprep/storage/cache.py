@@ -1,7 +1,7 @@
 """A folder of the local disk for data of places on object stores.
 
-It holds the work folders of builds to such places, and copies of files that must be on a disk to be
-read. All of it may be removed while nothing runs.
+It holds the work folders of builds to such places, copies of files that must be on a disk to be
+read, and indexes and members of archives. All of it may be removed while nothing runs.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def cached_file(place: RemotePlace) -> Path:
     """Return a path of the local disk with an object's content.
 
     The copy is valid while the object has the same size, tag and time; only one copy is kept.
-    OSError if the object cannot be read or the disk refuses.
+    OSError if the object cannot be read or the copy cannot be written.
     """
     with connected(place) as (system, name):
         entry = system.info(name)
@@ -72,7 +72,7 @@ def copied_version(place: RemotePlace) -> Path:
     """Return the local copy of a store's version, after making it if needed.
 
     Versions never change, so a copy is made once. StoreError if the place is no version, differs
-    from its pointer, or the disk refuses the copy.
+    from its pointer, or cannot be copied.
     """
     if not is_version(place):
         raise StoreError(

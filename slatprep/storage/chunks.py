@@ -28,12 +28,12 @@ _ZSTD_MAGIC = 0xFD2FB528
 _BLOSC_HEADER = 16
 
 MAX_TEXT_BYTES = 64 * 2**20
-"""Most bytes of an unpacked chunk of strings; 65,536 ids take 3 MiB."""
+"""Largest unpacked chunk of strings [byte]; 65,536 ids take 3 MiB."""
 
 
 @dataclass(frozen=True)
 class ChunkDecoder:
-    """The codecs of an array's chunks, as far as this module knows them.
+    """The codecs of an array's chunks, if this module allows them.
 
     `dtype` is little-endian, as stored, and object for text; `shape` is that of a chunk. The
     `compressor` is ``blosc``, ``zstd`` or empty. A checksum ends each chunk if `crc32c`. The
@@ -70,7 +70,7 @@ class ChunkDecoder:
 
     @cached_property
     def nbytes(self) -> int:
-        """Bytes of a decoded chunk."""
+        """Size of a decoded chunk [byte]."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     def decode(self, data: bytes, out: NDArray[Any]) -> None:
@@ -110,7 +110,7 @@ class ChunkDecoder:
 
 
 def crc32c_holds(data: bytes) -> bool:
-    """Whether bytes end with the CRC32C of the bytes before."""
+    """Return whether bytes end with the CRC32C of the bytes before."""
     import google_crc32c
 
     return len(data) >= 4 and int(google_crc32c.value(data)) == _CRC32C_RESIDUE
@@ -157,8 +157,8 @@ def single_threaded_blosc() -> Any:
     """Return numcodecs' blosc, with its own threads turned off."""
     from numcodecs import blosc
 
-    # Workers and training loaders are processes enough; a pool of threads in
-    # each would only get in their way, and does not survive a fork.
+    # Workers and training loaders are many processes already; a pool of threads in
+    # each would slow them down, and does not survive a fork.
     blosc.use_threads = False
     return blosc
 
@@ -195,12 +195,12 @@ def array_form(metadata: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype[A
 def read_chunks(
     metadata: Mapping[str, Any], fetch: Callable[[str, int], bytes | None]
 ) -> NDArray[Any]:
-    """Read an array of which each chunk is one file.
+    """Read an array that has one file per chunk.
 
-    `metadata` is its ``zarr.json``, whose shape the caller has checked. `fetch` returns the bytes
-    of a chunk by its name, such as ``c/0/1``, and by their largest number; None without such a
-    chunk. StoreError, ValueError or KeyError if the metadata make no sense, or a chunk contradicts
-    them.
+    `metadata` is its ``zarr.json``, whose shape the caller has checked. `fetch` takes the name of a
+    chunk, such as ``c/0/1``, and the largest number of bytes; it returns the bytes, or None without
+    such a chunk. StoreError, ValueError or KeyError if the metadata are invalid, or a chunk
+    contradicts them.
     """
     shape, native = array_form(metadata)
     dtype = native.newbyteorder("<")
@@ -208,7 +208,7 @@ def read_chunks(
     decoder = ChunkDecoder.of(dtype, steps, metadata["codecs"], 0)
     corners = [range(0, n, step) for n, step in zip(shape, steps, strict=True)]
     chunks = math.prod(map(len, corners))
-    # A writer may cut short arrays by the rows of long ones, but not rows wider than they are.
+    # A writer may give a short array the chunk rows of long arrays, but no chunk may be wider.
     wide = any(step > n for step, n in zip(steps[1:], shape[1:], strict=True))
     if wide or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= MAX_CHUNK_BYTES:
         raise ValueError(f"{chunks} chunks of {steps}")
@@ -223,13 +223,13 @@ def read_chunks(
         # A chunk that did not shrink is only a little larger than its values.
         data = fetch(separator.join(["c", *map(str, places)]), decoder.nbytes + 65_536)
         if data is None:
-            continue  # Zarr leaves out chunks of fill values alone.
+            continue  # Zarr writes no chunk of fill values alone.
         decoder.decode(data, block)
         place_chunk(array, corner, block)
     return array
 
 
 def place_chunk(array: NDArray[Any], corner: Sequence[int], block: NDArray[Any]) -> None:
-    """Write a chunk into an array from a corner on, but for what lies beyond the array."""
+    """Write a chunk into an array at a corner, without the part that lies beyond the array."""
     there = array[tuple(map(slice, corner, map(add, corner, block.shape)))]
     there[...] = block[tuple(map(slice, there.shape))]

@@ -1,4 +1,4 @@
-"""JSON documents from strangers, read with bounds on their size and their depth."""
+"""Read JSON documents from strangers, with limits on their size and depth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value")
 
 MAX_DEPTH = 64
-"""Most levels of nested objects and lists; a store's metadata have a dozen."""
+"""Largest number of levels of nested objects and lists; a store's metadata have a dozen."""
 
 
 def read_bounded(place: Place, limit: int) -> bytes:
@@ -59,7 +59,7 @@ def parse_json(data: bytes | str) -> Any:
 def unique(pairs: Sequence[tuple[str, _Value]]) -> dict[str, _Value]:
     """Return the entries of an object; ValueError if a key occurs twice.
 
-    This is a hook for `json.loads`, which by itself takes the last, for files that people write.
+    This is a hook for `json.loads`, which otherwise takes the last value, in files by people.
     """
     entries = dict(pairs)
     if len(entries) < len(pairs):
@@ -75,14 +75,14 @@ def read_document(place: Place, limit: int) -> dict[str, Any]:
 
 @lru_cache(maxsize=16)
 def adapter_of(kind: Any) -> TypeAdapter[Any]:
-    """Return what reads a kind of record, and knows its JSON Schema."""
-    # Late: pydantic takes a third of a second that a command without records does not have.
+    """Return the adapter that reads a kind of record and knows its JSON Schema."""
+    # Imported late: a command without records saves the third of a second that pydantic takes.
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
 
 
 def read_as(kind: type[_Value], text: bytes | str) -> _Value:
-    """Read a record of a kind from its JSON; pydantic's ValidationError, a ValueError, if none."""
+    """Read a record from its JSON; pydantic's ValidationError, a ValueError, if it is invalid."""
     read: _Value = adapter_of(kind).validate_json(text, strict=True)  # type: ignore[arg-type]
     return read

@@ -1,7 +1,7 @@
-"""Files of the local disk: reading by ranges, listing, digests, and names for them.
+"""Files of the local disk: read by ranges, list, hash and name them.
 
-A disk is asked for names one by one. An object store has no folders: it lists a thousand names in a
-request, and asking for a single name costs as much.
+A listing of a disk asks for names one by one. An object store has no folders: one request lists a
+thousand names, and a request for a single name costs as much.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class LocalFile(FileIO):
     """An unbuffered file of the local disk; threads may share it."""
 
     def __del__(self) -> None:
-        # A reader keeps its files open for its whole life, on purpose.
+        # A reader keeps its files open for its whole life, so no warning is given.
         self.close()
 
     def size(self) -> int:
@@ -51,10 +51,10 @@ class LocalFile(FileIO):
 
 
 class LocalFolder:
-    """An open directory: files read below it belong to one store, even if that is replaced.
+    """An open directory: files read below it belong to one store, even if the store is replaced.
 
-    Errors call it `path`. `prefetch_bytes` is the longest range to ask for at once; 0 for none,
-    where the system reads ahead by itself.
+    Errors call it `path`. `prefetch_bytes` is the longest range to read ahead; 0 means none,
+    because the system reads ahead by itself.
     """
 
     prefetch_bytes = 0
@@ -109,13 +109,13 @@ def private_file(path: Path) -> BufferedWriter:
 
 
 def is_only_ours(state: os.stat_result) -> bool:
-    """Whether a regular file, by its state, belongs to us and has only one name."""
+    """Return whether a regular file, by its state, belongs to us and has only one name."""
     user = getattr(os, "geteuid", lambda: state.st_uid)()
     return stat.S_ISREG(state.st_mode) and state.st_nlink == 1 and state.st_uid == user
 
 
 def is_at(descriptor: int, path: Path) -> bool:
-    """Whether an open file is still the file at a path."""
+    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:
@@ -125,7 +125,7 @@ def is_at(descriptor: int, path: Path) -> bool:
 def locks_alone(descriptor: int) -> bool:
     """Lock an open file unless another process has locked it; return whether that worked.
 
-    The lock ends with the process, however that ends. Windows has no such lock: always True.
+    The lock ends with the process, however the process ends. Windows has no such lock: always True.
     """
     if sys.platform == "win32":
         return True
@@ -141,8 +141,8 @@ def locks_alone(descriptor: int) -> bool:
 def take_file(source: Path, target: Path) -> None:
     """Give a file a second name, or copy it if it is not only ours or linking fails.
 
-    A copy shares its blocks with the original where the file system can. OSError if the file cannot
-    be read, or the disk refuses.
+    A copy shares its blocks with the original if the file system can. OSError if the file cannot
+    be read, or the copy cannot be written.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     if is_only_ours(source.lstat()):
@@ -151,7 +151,7 @@ def take_file(source: Path, target: Path) -> None:
             return
     with open_regular(source) as old, target.open("xb") as new:
         left = old.size()
-        with suppress(OSError, AttributeError):  # no such call, or none between these places
+        with suppress(OSError, AttributeError):  # The call may be missing or not work here.
             while left and (done := os.copy_file_range(old.fileno(), new.fileno(), left)):
                 left -= done
         new.seek(0, os.SEEK_END)
@@ -159,7 +159,7 @@ def take_file(source: Path, target: Path) -> None:
 
 
 LINK, OTHER = -1, -2
-"""Stand for a size: a symbolic link; a pipe, device or socket."""
+"""Values in place of a size: for a symbolic link, and for a pipe, device or socket."""
 
 
 def local_files(path: Path) -> dict[str, int]:
@@ -194,13 +194,13 @@ def open_digest(file: IO[bytes] | LocalFile) -> str:
 
 
 class Listing:
-    """Names below a folder of the local disk, up to date except that each folder is listed once.
+    """Names below a folder of the local disk, up to date except that the folder is listed once.
 
     Names are relative to the folder, with forward slashes.
     """
 
     def __init__(self, root: Path) -> None:
-        self._root = str(root)  # os.path.join is not called so often with a Path
+        self._root = str(root)  # os.path.join is slower with a Path.
 
     def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
         """Return the names of a folder's files, or of its folders; none if it does not exist.
@@ -210,7 +210,7 @@ class Listing:
         return (self._scan(folder) if folder else self._top)[folders]
 
     def is_file(self, path: str) -> bool:
-        """Whether this name exists and is not a folder; broken links count."""
+        """Return whether this name exists and is not a folder; broken links count."""
         full = os.path.join(self._root, path)  # noqa: PTH118 - half a million times
         link = False
         try:
@@ -223,10 +223,10 @@ class Listing:
 
     @cached_property
     def _top(self) -> tuple[list[str], list[str]]:
-        return self._scan("")  # Every pattern begins there.
+        return self._scan("")  # Every pattern begins at the root.
 
     def _scan(self, folder: str) -> tuple[list[str], list[str]]:
-        """Return the names in a folder: of files and others, and of folders."""
+        """Return the names in a folder: of files and other entries, and of folders."""
         found: tuple[list[str], list[str]] = ([], [])
         try:
             with os.scandir(os.path.join(self._root, folder)) as entries:  # noqa: PTH118
@@ -245,7 +245,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 class RemoteListing(Listing):
-    """Names below a place on an object store when it was listed, relative to the root."""
+    """Names below a place on an object store at the time of its listing, relative to the place."""
 
     def __init__(self, files: Iterable[str]) -> None:
         self.files = frozenset(files)
@@ -274,9 +274,9 @@ _LONGEST_NAME = 180
 def file_name(asset_id: str, *, dots: bool = True) -> str:
     """Return a file name for an asset of any id, without suffix.
 
-    Plain ids stay unchanged. Characters that mean something to a shell, an archive or a file system
-    are percent-encoded, as are a leading sign and, without `dots`, dots. Names that would be too
-    long end in a hash.
+    Plain ids stay unchanged. Characters with a meaning to a shell, an archive or a file system are
+    percent-encoded, as are a leading sign and, without `dots`, dots. A name that is too long is cut
+    and ends in a hash.
 
     >>> file_name("0a1b2c.front"), file_name("0a1b2c.front", dots=False)
     ('0a1b2c.front', '0a1b2c%2Efront')

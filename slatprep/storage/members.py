@@ -1,4 +1,4 @@
-"""Places within archives: the tree that several of them make up, and bringing its members here."""
+"""Places within archives: the tree that several archives make up, and how to fetch its members."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from slatprep.storage.states import Noted
 from slatprep.storage.tar import BLOCK, MAX_KEPT, Entry
 
 _AT_ONCE = 8
-"""Archives that are read at the same time."""
+"""Number of requests for archives that run at the same time."""
 
 
 class ArchiveTree:
-    """The folder that archives were made of.
+    """The folder from which archives were made.
 
-    `text` is what it is called: the folder that holds the archives, or the only one. `progress`
-    is called with the bytes of archives that were looked through, and those of all.
+    `text` is its name: the folder that holds the archives, or the only archive. `progress` is
+    called with the number of bytes of archives that were scanned, and of all archives.
     """
 
     def __init__(
@@ -40,9 +40,9 @@ class ArchiveTree:
 
     @cached_property
     def indexes(self) -> dict[Archive, Index]:
-        """What each archive holds; those of an object store are read at the same time.
+        """Index of each archive; archives of an object store are read at the same time.
 
-        OSError if one cannot be read. What was found by then is kept.
+        OSError if an archive cannot be read. The members found by then are kept.
         """
         passed, total = dict[Archive, int](), sum(archive.size for archive in self.archives)
 
@@ -53,7 +53,7 @@ class ArchiveTree:
 
             return archive.index(tell)
 
-        # Local ones one by one here: who stops a scan waits for none of them.
+        # Local archives are read one by one in this thread, so stopping a scan waits for none.
         remote = [archive for archive in self.archives if isinstance(archive.place, RemotePlace)]
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             coming = {archive: pool.submit(index, archive) for archive in remote}
@@ -64,7 +64,7 @@ class ArchiveTree:
 
     @cached_property
     def members(self) -> dict[str, tuple[Archive, Entry]]:
-        """Where the members lie that may be asked for, by name."""
+        """Archive and entry of each wanted member, by name."""
         members: dict[str, tuple[Archive, Entry]] = {}
         for archive, index in self.indexes.items():
             for name, entry in index.members.items():
@@ -77,15 +77,15 @@ class ArchiveTree:
         return members
 
     def listing(self) -> MemberListing:
-        """Return the names that may be asked for, and what is damaged."""
+        """Return a listing of the wanted members and the damaged archives."""
         faults = {a.place.name: index.fault for a, index in self.indexes.items() if index.fault}
         return MemberListing(self.members, faults)
 
 
 class ArchivePlace(PlaceByText):
-    """The tree of archives, with an empty `path`, or a file in it.
+    """A tree of archives, if `path` is empty, or a file in it.
 
-    `archive` and `entry` tell where it lies; without them there is no such file.
+    `archive` and `entry` say where the file lies; they are None if there is no such file.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class ArchivePlace(PlaceByText):
 
     @property
     def size(self) -> int:
-        """Its bytes; 0 where there is none."""
+        """Size of the file [byte]; 0 if there is none."""
         return 0 if self.entry is None else self.entry.size
 
     @property
@@ -122,25 +122,25 @@ class ArchivePlace(PlaceByText):
         return self._below(f"{self.path}/{key}" if self.path else key)
 
     def exists(self) -> bool:
-        """Whether there is a file, or this is the tree."""
+        """Return whether there is a file, or this is the tree."""
         return self.is_dir() or self.is_file()
 
     def is_dir(self) -> bool:
-        """Whether this is the tree; other folders are not looked for."""
+        """Return whether this is the tree; other folders do not count."""
         return not self.path
 
     def is_file(self) -> bool:
-        """Whether there is a file."""
+        """Return whether there is a file."""
         return self.entry is not None
 
     def _opened(self) -> IO[bytes]:
         return io.BytesIO(self.read_bytes())
 
     def read_bytes(self) -> bytes:
-        """Read a file whole.
+        """Read a whole file.
 
-        FileNotFoundError if there is none, InputError if it is no plain file or the archive is
-        another one by now.
+        FileNotFoundError if there is none. InputError if it is not a plain file, or the archive was
+        replaced.
         """
         if self.archive is None or self.entry is None:
             raise FileNotFoundError(errno.ENOENT, "is in no archive", str(self))
@@ -149,7 +149,7 @@ class ArchivePlace(PlaceByText):
         return self.archive.read(self.entry)
 
     def state(self) -> Noted:
-        """Return what tells whether it was changed since; None where that cannot be told."""
+        """Return values by which a later change is found; None if it cannot be."""
         if self.archive is None or self.entry is None or not self.archive.trusted:
             return None
         return (str(self), self.archive.stamp, *self.entry)
@@ -160,7 +160,7 @@ class ArchivePlace(PlaceByText):
 
 
 class MemberListing(RemoteListing):
-    """Names in archives; those that are damaged look like folders that cannot be listed."""
+    """Names in archives; a damaged archive looks like a folder that cannot be listed."""
 
     def __init__(self, files: Iterable[str], faults: dict[str, str]) -> None:
         super().__init__(files)
@@ -175,16 +175,16 @@ class MemberListing(RemoteListing):
 
 
 _GAP, _MOST = 2**18, 2**24
-"""Bytes between members that are read with them; bytes of one request with several members."""
+"""Largest gap between members of one request, and largest request for several members [byte]."""
 
 Members = list[Entry]
 
 
 def fetch(wanted: Iterable[tuple[Archive, Entry]], progress: Callable[[int, int], None]) -> None:
-    """Bring members into the cache that are not there.
+    """Fetch members that the cache lacks, except those of gzip archives.
 
-    `progress` is called with the bytes that were fetched and those in all. ConfigError if an
-    archive cannot be read; one that was replaced is left to whoever reads its members.
+    `progress` is called with the number of bytes fetched, and the total. ConfigError if an archive
+    cannot be read. A replaced archive raises no error here, only when its members are read.
     """
     requests = list(_requests(wanted))
     total, done = sum(_span(members)[1] for _, members in requests), 0
@@ -213,7 +213,7 @@ def fetch(wanted: Iterable[tuple[Archive, Entry]], progress: Callable[[int, int]
 
 
 def _requests(wanted: Iterable[tuple[Archive, Entry]]) -> Iterator[tuple[Archive, Members]]:
-    """Yield members that one request brings: of one archive, and near each other."""
+    """Yield groups of missing members for one request each: near each other in one archive."""
     missing: dict[Archive, Members] = {}
     for archive, entry in wanted:
         unusable = archive.packed or entry.problem or entry.size > MAX_KEPT
@@ -233,7 +233,7 @@ def _requests(wanted: Iterable[tuple[Archive, Entry]]) -> Iterator[tuple[Archive
 
 
 def _span(members: Members) -> tuple[int, int]:
-    """Return where the header of the first member begins, and the bytes to the last one's end."""
+    """Return the offset of the first member's header, and the bytes to the last member's end."""
     begin = members[0].offset - BLOCK
     return begin, members[-1].offset + members[-1].size - begin
 

@@ -1,8 +1,7 @@
 """Places on the local disk and on object stores, behind one protocol.
 
-`slatprep.records.Place` is enough to name a place or to read it whole: `pathlib.Path` and
-`RemotePlace` both implement it. Work that differs between the two is a method of `Storage`, and
-only this module asks which kind it is.
+`slatprep.records.Place` is enough to name a place or to read a whole file: `pathlib.Path` and
+`RemotePlace` both implement it. Work that differs between the two is a method of `Storage`.
 """
 
 from __future__ import annotations
@@ -80,7 +79,7 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
 
 
 def is_place(value: object) -> TypeGuard[Path | RemotePlace | ArchivePlace]:
-    """Whether a value is a path, a URL from `place_of`, or lies in archives."""
+    """Return whether a value is a path, a URL from `place_of`, or a place in archives."""
     return isinstance(value, Path | RemotePlace | ArchivePlace)
 
 
@@ -106,7 +105,7 @@ class Storage:
         self.local = self._path = path
 
     def files(self) -> dict[str, int]:
-        """Return the names and bytes of all files below the place, as `local_files`.
+        """Return the names and sizes [byte] of all files below the place, as `local_files`.
 
         Raises StoreError if they cannot be listed.
         """
@@ -120,7 +119,7 @@ class Storage:
         return local_files(self._path)
 
     def listing(self) -> Listing:
-        """Return the names below the place, for looking them up one by one."""
+        """Return a listing of the place, which answers for names one by one."""
         return Listing(self._path)
 
     def names(self) -> tuple[list[str], list[str]]:
@@ -130,7 +129,7 @@ class Storage:
 
     @property
     def absent(self) -> str:
-        """What to say where there is nothing at the place: how far the path leads."""
+        """Words for a message if there is nothing at the place: how far the path leads."""
         if self.local is None:
             return "does not exist"
         above = next(path for path in self.local.absolute().parents if path.is_dir())
@@ -142,7 +141,7 @@ class Storage:
         return f"does not exist; {above} does, and holds the folders {held}"
 
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
-        """Look at archives that lie in the place, of whose members those like `wanted` matter.
+        """Return archives that lie in the place, by name; only members like `wanted` matter.
 
         OSError if one cannot be read, InputError if one is a link that leads out of the place.
         """
@@ -192,9 +191,9 @@ class Storage:
         return io.BufferedReader(open_regular(self._path))
 
     def read(self, limit: int, asked: Place | None = None) -> bytes:
-        """Read at most `limit` + 1 bytes of a file; the last shows that it is too large.
+        """Read at most `limit` + 1 bytes of a file; the last byte shows that it is too large.
 
-        Its state is noted under what was `asked` for, see `slatprep.storage.states`.
+        The file's state is noted under `asked`, or its own place; see `slatprep.storage.states`.
         """
         with open_regular(self._path) as file, reading(file.fileno(), str(asked or self._path)):
             # read() would allocate all that it is allowed to return.
@@ -213,7 +212,7 @@ class Storage:
         return self._path
 
     def state(self, states: States) -> Noted:
-        """Return what tells whether the file was changed since; None if unknown."""
+        """Return values by which a later change is found; None if it cannot be."""
         return states.of(str(self._path))
 
     def current_version(self) -> Place:
@@ -239,7 +238,7 @@ class Storage:
 
 
 def _may_lead_to(root: Path, file: Path) -> bool:
-    """Whether a link below a root may lead to a file: below it, or in the hub's cache of it."""
+    """Return whether a link below a root may lead to a file: below it, or in its hub cache."""
     if file.is_relative_to(root):
         return True
     # The hub's cache has snapshots/COMMIT/..., whose files are links into blobs.
@@ -345,7 +344,7 @@ class _Archives(Storage):
         return self.place.open("rb")
 
     def read(self, limit: int, asked: Place | None = None) -> bytes:
-        # One that is larger is not read, whatever its header claims.
+        # A file that is too large is not read: zeros stand for its content.
         data = bytes(limit + 1) if self.place.size > limit else self.place.read_bytes()
         note(str(asked or self.place), self.place.state())
         return data

@@ -1,7 +1,7 @@
-"""Ranged reads from S3 by obstore, where it is installed and can serve.
+"""Read ranges from S3 with obstore, if it is installed and usable.
 
-Its client in Rust takes less time a request than s3fs. It does not read ``~/.aws``, and hangs in a
-process forked from one that has used it; there, and without it, s3fs reads.
+Its Rust client takes less time per request than s3fs. It does not read ``~/.aws``, and hangs in a
+process that was forked after using it. If obstore cannot be used, s3fs reads.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from importlib.util import find_spec
 from typing import Any
 
 ReadRange = Callable[[str, int, int], bytes]
-"""Reads a key from one offset up to, without, another."""
+"""Function that reads a key from a start offset up to, without, an end offset."""
 
 _forked_from_user = False
 
 
 def range_reader(bucket: str) -> ReadRange | None:
-    """Return what reads ranges of a bucket's objects; None where s3fs has to.
+    """Return a reader of ranges of a bucket's objects; None if s3fs has to read them.
 
-    Credentials have to be in ``AWS_ACCESS_KEY_ID`` and ``AWS_SECRET_ACCESS_KEY``, the region or
-    endpoint in ``AWS_REGION``, ``AWS_DEFAULT_REGION`` or ``AWS_ENDPOINT_URL``.
-    ``SLATPREP_OBSTORE=no`` forbids it. The reader raises FileNotFoundError, PermissionError or
-    OSError.
+    Credentials must be in ``AWS_ACCESS_KEY_ID`` and ``AWS_SECRET_ACCESS_KEY``, the region or
+    endpoint in ``AWS_REGION``, ``AWS_DEFAULT_REGION``, ``AWS_ENDPOINT_URL`` or
+    ``AWS_ENDPOINT_URL_S3``. ``AWS_PROFILE`` or ``SLATPREP_OBSTORE=no`` turns it off. The reader
+    raises FileNotFoundError, PermissionError or OSError.
     """
     known = os.environ.get("AWS_ACCESS_KEY_ID") and os.environ.get("AWS_SECRET_ACCESS_KEY")
     region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
@@ -40,7 +40,7 @@ def range_reader(bucket: str) -> ReadRange | None:
 def _available() -> bool:
     import fsspec.config
 
-    # What a user tells fsspec of S3, s3fs alone understands.
+    # Only s3fs understands a user's settings of fsspec for S3.
     return find_spec("obstore") is not None and not fsspec.config.conf.get("s3")
 
 

@@ -1,10 +1,10 @@
 """Places on object stores, reached through fsspec.
 
-A `RemotePlace` has the few methods of `slatprep.records.Place` and no others. Only
+A `RemotePlace` has the methods of `slatprep.records.Place` and few others. Only
 `RemotePlace.upload`, `put_objects`, `copy_objects` and `remove_objects` change objects.
 
-Credentials and endpoints are left to the libraries: those of S3, for instance, come from ``AWS_*``
-variables or ``~/.aws``.
+The libraries find credentials and endpoints; for S3, for instance, in ``AWS_*`` variables or
+``~/.aws``.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ BUFFER_BYTES = 8 * 2**20
 
 
 class PlaceByText:
-    """What places share that are no paths: they are what their text says."""
+    """Base of places that are not paths; the text of a place identifies it."""
 
-    # Not a dataclass: JSON writers would write that as a table of its fields.
+    # Not a dataclass, because JSON writers would write a table of its fields.
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self)!r})"
 
@@ -49,7 +49,7 @@ class PlaceByText:
         return PurePosixPath(str(self)).suffix
 
     def absolute(self) -> Self:
-        """Return the same."""
+        """Return the place itself."""
         return self
 
     def open(
@@ -73,9 +73,9 @@ class PlaceByText:
 class RemotePlace(PlaceByText):
     """The URL of an object or of all objects below it; see `slatprep.storage.place.place_of`.
 
-    `protocol` is such as ``s3``, `path` is bucket and key. Names join as in a path. Every method
-    that asks the object store turns the libraries' errors into OSError. It raises ConfigError if a
-    library is missing or the protocol is unknown.
+    `protocol` is ``s3``, for instance, and `path` is bucket and key. Names join as in a path. Every
+    method that asks the object store turns the libraries' errors into OSError. It raises
+    ConfigError if a library is missing or the protocol is unknown.
     """
 
     def __init__(self, protocol: str, path: PurePosixPath) -> None:
@@ -91,7 +91,7 @@ class RemotePlace(PlaceByText):
 
     @property
     def parent(self) -> RemotePlace:
-        """The place that holds it."""
+        """The place that holds this place."""
         return RemotePlace(self.protocol, self.path.parent)
 
     def __truediv__(self, key: str) -> RemotePlace:
@@ -99,15 +99,15 @@ class RemotePlace(PlaceByText):
         return RemotePlace(self.protocol, PurePosixPath(f"{self.path}/{key}"))
 
     def exists(self) -> bool:
-        """Whether it is an object, or there are objects below it."""
+        """Return whether it is an object, or there are objects below it."""
         return bool(self.entry())
 
     def is_dir(self) -> bool:
-        """Whether there are objects below it, and none of this name."""
+        """Return whether there are objects below it, and none of this name."""
         return self.entry().get("type") == "directory"
 
     def is_file(self) -> bool:
-        """Whether it is an object."""
+        """Return whether it is an object."""
         return self.entry().get("type") == "file"
 
     def _opened(self) -> IO[bytes]:
@@ -124,8 +124,8 @@ class RemotePlace(PlaceByText):
             system.put_file(str(local), name, **multipart_options(system))
 
     def entry(self) -> Mapping[str, Any]:
-        """Return what fsspec says of it; nothing where there is nothing."""
-        # Not isdir, which lists everything below.
+        """Return fsspec's entry of the place; empty if there is nothing."""
+        # Not by `isdir`, which lists everything below.
         try:
             with connected(self) as (system, name):
                 return dict(system.info(name))
@@ -136,7 +136,7 @@ class RemotePlace(PlaceByText):
 class RemoteFile(io.RawIOBase):
     """An object open for reading; threads may share it if they use only `pread`.
 
-    Its `size` is asked for where it is not given.
+    If `size` is not given, the object store is asked for it when it is needed.
     """
 
     def __init__(self, place: RemotePlace, size: int | None = None) -> None:
@@ -156,7 +156,7 @@ class RemoteFile(io.RawIOBase):
 
     def pread(self, length: int, offset: int) -> bytes:
         """Read up to `length` bytes from an offset, with one request."""
-        # Asked for each time: connections do not survive a fork; fsspec caches one per process.
+        # Connect each time: connections do not survive a fork; fsspec caches one per process.
         try:
             with connected(self.place, fresh=False) as (system, name):
                 if "s3" in system.protocol:
@@ -164,7 +164,7 @@ class RemoteFile(io.RawIOBase):
                     if read := range_reader(bucket):
                         return read(key, offset, offset + length)
                 options: dict[str, Any] = {}
-                if "hf" in system.protocol:  # It would read ahead, and ask for the size.
+                if "hf" in system.protocol:  # Otherwise it reads ahead, and asks for the size.
                     options = {"cache_type": "none", "size": self.size()}
                 return bytes(system.cat_file(name, start=offset, end=offset + length, **options))
         except (FileNotFoundError, PermissionError):
@@ -175,11 +175,11 @@ class RemoteFile(io.RawIOBase):
             return b""  # Servers refuse a range that begins after the end.
 
     def readall(self) -> bytes:
-        """Read to the end, in blocks of `io.BufferedReader`: Python's own have 8 kB."""
+        """Read to the end in blocks of `BUFFER_BYTES`, because Python's own have 8 kB."""
         return b"".join(iter(lambda: self.read(BUFFER_BYTES) or b"", b""))
 
     def tell(self) -> int:
-        """Return how far it was read from its beginning."""
+        """Return the number of bytes read from the beginning."""
         return self._position
 
     def readable(self) -> bool:
@@ -187,7 +187,7 @@ class RemoteFile(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Read on, for `io.BufferedReader`."""
+        """Read the next bytes, for `io.BufferedReader`."""
         if self._ended:
             return 0
         data = self.pread(len(buffer), self._position)
@@ -198,7 +198,7 @@ class RemoteFile(io.RawIOBase):
 
 
 class RemoteFolder:
-    """A version of a store on an object store; it belongs to one store, since it never changes."""
+    """A version of a store on an object store; it never changes, so its files belong together."""
 
     prefetch_bytes = 64 * 2**20
 
@@ -212,15 +212,15 @@ class RemoteFolder:
 
 
 def stamp_of(entry: Mapping[str, Any]) -> str:
-    """Return what an object store tells of an object's content, in fsspec's entry of it."""
+    """Return the size, tags and time in fsspec's entry of an object, which tell its content."""
     return " ".join(str(entry[key]) for key in ("size", *_TAGS) if entry.get(key))
 
 
 def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
-    """Return fsspec's entry of every object below a place, by its name relative to that.
+    """Return fsspec's entry of every object below a place, by its name relative to the place.
 
-    Objects are left out if no path could have their name: with empty parts, ``.`` or ``..``. The
-    result may be empty.
+    Objects are left out if no path could have their name, such as one with empty parts, ``.`` or
+    ``..``. The result may be empty.
     """
     with connected(place) as (system, name):
         found = system.find(name, detail=True)
@@ -234,7 +234,7 @@ def list_objects(place: RemotePlace) -> dict[str, dict[str, Any]]:
 
 
 def list_folder(place: RemotePlace) -> dict[str, dict[str, Any]]:
-    """Return what fsspec says of what lies directly below a place, by name; nothing if nothing."""
+    """Return fsspec's entry of everything directly below a place, by name; it may be empty."""
     with connected(place) as (system, name):
         try:
             found = system.ls(name, detail=True)
@@ -245,9 +245,9 @@ def list_folder(place: RemotePlace) -> dict[str, dict[str, Any]]:
 
 
 def pinned(place: RemotePlace) -> RemotePlace:
-    """Return a place of the hub at the commit that is there now, so that nothing can replace it.
+    """Return a place of the hub at its current commit, so that nothing can replace it.
 
-    Places elsewhere have no commits, and are returned as they are.
+    Other places have no commits, and are returned as they are.
     """
     if place.protocol != "hf":
         return place
@@ -285,7 +285,7 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
 
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
-"""What helps where S3 has no credentials."""
+"""Advice if S3 finds no credentials."""
 
 
 def _is_plain(name: str) -> bool:
@@ -293,9 +293,9 @@ def _is_plain(name: str) -> bool:
 
 
 def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str, int]:
-    """Return options that limit the memory of a transfer, to 64 MiB a file on S3.
+    """Return options that limit the memory of a transfer, to 64 MiB per file on S3.
 
-    S3 takes 10,000 parts, and so 160 GiB a file. `files_at_once` is for transfers of several files.
+    S3 takes 10,000 parts, so 160 GiB per file. `files_at_once` is for transfers of several files.
     """
     parts = {"chunksize": PART_BYTES, "max_concurrency": 4} if "s3" in system.protocol else {}
     if files_at_once is None or not system.async_impl:
@@ -307,7 +307,7 @@ def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str
 def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, str]]:
     """Yield the fsspec file system of a place, and the place's name in it.
 
-    With `fresh`, what it knows of folders is asked for again.
+    With `fresh`, the file system forgets its listings of folders.
 
     Errors of the file system become OSErrors of the same kind (`FileNotFoundError`,
     `PermissionError`) that name the place. ConfigError if a library is missing or the protocol is
@@ -316,7 +316,7 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
     try:
         from fsspec.core import url_to_fs
 
-        # Without the cache of listings: what others write must be seen.
+        # Without the cache of listings, because changes by others must be seen.
         system, name = url_to_fs(str(place), use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise ConfigError(
@@ -324,7 +324,7 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
             "'slatprep[hub]' hf://, and gcsfs gs://"
         ) from None
     if fresh and "hf" in system.protocol:
-        system.dircache.clear()  # The hub's keeps listings whatever it is told.
+        system.dircache.clear()  # The hub's file system keeps listings in spite of the option.
     try:
         yield system, str(name)
     except OSError as error:
@@ -335,7 +335,7 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
             number = errno.EACCES
         raise OSError(number, _words(error.strerror or error), str(place)) from error
     except Exception as error:
-        # botocore, aiohttp and google.auth have errors of their own, with no base in common.
+        # botocore, aiohttp and google.auth have errors of their own, without a common base.
         if type(error).__module__ == "builtins":
             raise
         raise OSError(errno.EIO, _words(error), str(place)) from error

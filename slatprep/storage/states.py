@@ -1,20 +1,20 @@
-"""What tells whether a file was changed since it was read, and where nothing can.
+"""Tell whether a file was changed since it was read, if that can be told.
 
 The state of a file is its mount, inode and size, and the times at which its content and its inode
-changed. It proves that the content is the same only where the system sets these times at each
-change. So a state counts where all of this holds:
+changed. An equal state proves equal content only if the system sets these times at each change. So
+a state counts only if all of this holds:
 
-- The file system sets both times itself, lies on a disk of this machine and can be written. An
-  image that is mounted read-only has the times that it was made with, and what lies on a network
-  is changed elsewhere.
+- The file system sets both times itself, lies on a disk of this machine and can be written. A
+  read-only image keeps the times at which it was made, and files on a network are changed
+  elsewhere.
 - The mount is the same. Another disk may hold the same inode, size and times.
-- Nobody had the file open for writing when its reading began. Of the writes to a page of a
-  mapping, only the first changes the times.
-- It was not written so shortly before that a later change could leave the same times, as in git.
+- Nobody had the file open for writing when its reading began. Only the first write to a page of a
+  mapping changes the times.
+- The file was not written just before, as a later change could leave the same times. Git has this
+  problem too.
 
-A file is read, and its state taken, through one descriptor: neither a link nor a folder that is
-exchanged meanwhile can part them. Systems other than Linux do not tell enough, so that no state
-counts there.
+Content and state are read through one descriptor, so they belong together even if a link or folder
+is exchanged meanwhile. Systems other than Linux do not tell enough, so no state counts there.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 FINE_NS, COARSE_NS = 100_000_000, 2_000_000_000
-"""How long before a look a file must have been written. File systems with times in nanoseconds
-stamp by the clock's tick, 10 ms at most; where times are rounder, the roughest, FAT, has 2 s."""
+"""Least age [ns] of a file's times, if they are fine or coarse. Fine times, in nanoseconds, follow
+the clock's tick, 10 ms at most. The coarsest times, those of FAT, have steps of 2 s."""
 
 _KEEPING = {"ext2", "ext3", "ext4", "xfs", "btrfs", "f2fs"}
-"""File systems that set the times at the first write to each page of a mapping, too."""
+"""File systems that also set the times at the first write to each page of a mapping."""
 
 _LOOP = "7"
-"""Major number of disks that are files."""
+"""Major number of loop devices, which are disks in files."""
 
 # From linux/stat.h and linux/fcntl.h: `os.stat` does not tell the mount.
 _BASIC, _MOUNT, _UNIQUE_MOUNT = 0x7FF, 0x1000, 0x4000
@@ -61,20 +61,20 @@ class State(NamedTuple):
 
 
 Noted = tuple[object, ...] | None
-"""What is noted of a file that was read: its state, or what tells a member of an archive."""
+"""Note on a file that was read: its state, or values that identify a member of an archive."""
 
 
 class States:
-    """Looks at states of files; whether those of a mount count is asked once."""
+    """Reads states of files; checks only once whether those of a mount count."""
 
     def __init__(self) -> None:
         self._counts: dict[int, bool] = {}
         self.noted: dict[str, Noted] = {}
 
     def of(self, file: str | int) -> State | None:
-        """Return the state of a file, by path or descriptor; None where it does not count.
+        """Return the state of a file, by path or descriptor; None if its mount does not count.
 
-        The file may have been written just now, and be open for writing.
+        The file may have been written just before, or be open for writing.
         """
         found = _statx(file)
         if found is None:
@@ -87,7 +87,7 @@ class States:
 
 
 def keeps_times(mountinfo: str, mount: int) -> bool:
-    """Whether every change of a file on a mount changes the file's times.
+    """Return whether every change of a file on a mount changes the file's times.
 
     `mountinfo` is the text of ``/proc/self/mountinfo``, `mount` a number at the start of a line.
     """
@@ -97,13 +97,13 @@ def keeps_times(mountinfo: str, mount: int) -> bool:
         if number == str(mount):
             kind, *_, options = system.split(" ")
             local = kind in _KEEPING and device.partition(":")[0] != _LOOP
-            return local and "rw" in options.split(",")  # of the file system, not of the mount
+            return local and "rw" in options.split(",")  # options of the system, not the mount
     return False
 
 
 @lru_cache(maxsize=1)
 def boot_id() -> str:
-    """Return what tells this run of the machine, in which alone numbers of mounts hold."""
+    """Return the id of the machine's current boot; numbers of mounts hold only within it."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -111,13 +111,13 @@ def boot_id() -> str:
 
 
 def is_old(modified_ns: int, changed_ns: int) -> bool:
-    """Whether a change from now on gives a file other times than these."""
+    """Return whether any change from now on gives a file other times than these [ns]."""
     newest = max(modified_ns, changed_ns)
     return newest + (FINE_NS if newest % 1_000_000 else COARSE_NS) <= time.time_ns()
 
 
 def wait_until_old() -> None:
-    """Wait until what was written before is old, where times are fine."""
+    """Wait until files written before this call are old, if their times are fine."""
     time.sleep(FINE_NS / 1e9)
 
 
@@ -125,7 +125,7 @@ _noting: ContextVar[States | None] = ContextVar("noting", default=None)
 
 
 def lasting_state(descriptor: int) -> State | None:
-    """Return the state of an open file that every later change will change; None if none will."""
+    """Return the state of an open file if every later change will alter it, else None."""
     if not _nobody_writes(descriptor):
         return None
     state = (_noting.get() or States()).of(descriptor)
@@ -134,7 +134,7 @@ def lasting_state(descriptor: int) -> State | None:
 
 @contextmanager
 def noting() -> Iterator[dict[str, Noted]]:
-    """Collect the states of files as they are read meanwhile, by name; None where none counts."""
+    """Collect the states of files that are read meanwhile, by name; None if a state is no proof."""
     states = States()
     token = _noting.set(states)
     try:
@@ -145,7 +145,7 @@ def noting() -> Iterator[dict[str, Noted]]:
 
 @contextmanager
 def reading(descriptor: int, name: str) -> Iterator[None]:
-    """Note under a name the state of an open file, unless it is another when it has been read."""
+    """Note the state of an open file under a name; note None if it changes during reading."""
     if _noting.get() is None:
         yield
         return
@@ -155,23 +155,23 @@ def reading(descriptor: int, name: str) -> Iterator[None]:
 
 
 def note(name: str, state: Noted) -> None:
-    """Note the state of what was read; of what was read twice, if it is the same."""
+    """Note the state of a file under a name; note None if an earlier reading had another state."""
     if states := _noting.get():
         states.noted[name] = state if states.noted.get(name, state) == state else None
 
 
 def _nobody_writes(descriptor: int) -> bool:
-    """Whether no process has a file open for writing, or mapped; False where it cannot be told.
+    """Return whether no process has a file open for writing, or mapped; False if unknown.
 
-    The system refuses a lease for reading where one has. It gives leases to the file's owner and
-    to root alone.
+    The system refuses a lease for reading if a process has. It gives leases only to the file's
+    owner and to root.
     """
     if sys.platform != "linux":
         return False
     import fcntl
 
     try:
-        # Whoever opens the file meanwhile waits for its end, and we get a signal that is ignored.
+        # A process that opens the file meanwhile waits for the lease's end; our signal is ignored.
         fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_UNLCK)
@@ -181,7 +181,7 @@ def _nobody_writes(descriptor: int) -> bool:
 
 
 def _statx(file: str | int, mask: int = _BASIC | _MOUNT | _UNIQUE_MOUNT) -> State | None:
-    """Ask for the state of a regular file; None where the system does not tell it."""
+    """Return the state of a regular file; None if the system does not tell it."""
     call, buffer = _statx_call(), ctypes.create_string_buffer(_STATX_BYTES)
     name = b"" if isinstance(file, int) else os.fsencode(file)
     where, flags = (file, _EMPTY_PATH) if isinstance(file, int) else (_HERE, 0)

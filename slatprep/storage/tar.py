@@ -1,9 +1,8 @@
-"""The members of tar archives: where they lie, found by reading headers alone.
+"""Find the members of tar archives by reading only headers, with few requests and few bytes.
 
-They are read with as few requests and as few bytes as may be. A walk writes the files of a folder
-one after another: what lies between two of them lies in that folder. So the files of a folder that
-nobody asks for are leaped over: a later header of it is sought, about where the last such folder
-had its last ones.
+An archive has the files of a folder one after another, so a member between two of them lies in the
+same folder. `Leaps` therefore skips files of a folder that nobody asks for: it searches for a later
+header of that folder, about where the last folder of the same name had its last headers.
 """
 
 from __future__ import annotations
@@ -18,28 +17,28 @@ from typing import NamedTuple, Protocol
 
 
 class Ranges(Protocol):
-    """What is read by ranges: `slatprep.storage.place.RangeFile` is one."""
+    """A file that is read by ranges, such as `slatprep.storage.place.RangeFile`."""
 
     def pread(self, length: int, offset: int) -> bytes:
         """Read up to `length` bytes from an offset on."""
 
 
 MAX_READ = 2**20
-"""Most that one read may ask for: what a header claims is not believed."""
+"""Largest read [byte], because a header may claim any size."""
 
 _LEAST, _MOST, _NEAR = 2**13, 2**22, 2**21
-"""Bytes: a request after a jump; the largest request; a gap that costs less than a request."""
+"""Bytes of a request after a jump, of the largest request, of a gap cheaper than a request."""
 
 _SHARE, _SLACK = 0.015, 2**22
-"""Requests grow as long as no more than this share of what lies before was read, and so much."""
+"""Share of the bytes before the position that may be read, and bytes that may be read besides."""
 
 
 class ReadAhead(io.RawIOBase):
     """A file object over ranges, for reading headers that lie between members of any size.
 
-    After a jump it asks for little. As long as the next headers are near, each request is twice
-    the last one: many small members come with one request, and large ones are passed over.
-    Of a file that is not `remote` all requests are small.
+    After a jump the request is small. As long as the next headers are near, each request is twice
+    as large as the last. So one request brings many small members, and large members are skipped.
+    If the file is not `remote`, all requests are small.
     """
 
     def __init__(self, file: Ranges, remote: bool) -> None:
@@ -60,7 +59,7 @@ class ReadAhead(io.RawIOBase):
         return offset
 
     def read(self, length: int = -1) -> bytes:
-        """Read on; fewer bytes than asked for mean the end. ValueError above `MAX_READ`."""
+        """Read the next bytes; fewer than `length` mean the end. ValueError above `MAX_READ`."""
         if not 0 <= length <= MAX_READ:
             raise ValueError(f"a header claims {length} bytes")
         data = self.held(length, self._at)
@@ -68,15 +67,15 @@ class ReadAhead(io.RawIOBase):
         return data
 
     def holds(self, length: int, offset: int) -> bool:
-        """Whether a range was read already."""
+        """Return whether the buffer has a range."""
         return self._begin <= offset and offset + length <= self._begin + len(self._data)
 
     def affords(self, length: int) -> bool:
-        """Whether so much may be read at once; growing requests leave half for it."""
+        """Return whether `length` bytes may be read; growing requests leave half for this."""
         return self._spent + length <= self._allowed
 
     def held(self, length: int, offset: int) -> bytes:
-        """Return a range, from what was read already if it can be."""
+        """Return a range, from the buffer if it has it."""
         end = self._begin + len(self._data)
         if not self.holds(length, offset):
             near = 0 <= offset - end <= _NEAR or self._begin <= offset < end
@@ -92,17 +91,17 @@ class ReadAhead(io.RawIOBase):
 _MAGIC_AT = 257
 
 _NARROWEST, _WIDEST = 2**14, 2**19
-"""Bytes that are read to find a header."""
+"""Least and largest window [byte] in which a header is searched."""
 
 _FIRST, _WIDER = 3, 8
-"""Files that tell how large the next ones are; so many of these are leaped over first."""
+"""Number of files from which the size of the next files is known; files in the first leap."""
 
 _FARTHEST = 2**27
-"""Bytes: no leap is wider, so that none leads into another copy of the folder."""
+"""Longest leap [byte], so that no leap leads into another copy of the folder."""
 
 
 class Leaps:
-    """What is known of the folders that were passed, for leaping within the next ones."""
+    """Leaps within a folder, planned by what is known of earlier folders."""
 
     def __init__(self, file: ReadAhead) -> None:
         self._file = file
@@ -111,14 +110,14 @@ class Leaps:
         self._files, self._bytes, self._reach, self._beyond = 0, 0, 0, 0
 
     def after(self, folder: str, data: int, end: int) -> int:
-        """Return where to read on after a file of a folder: at `end`, or at a later header of it.
+        """Return where to go on after a file of a folder: `end`, or a later header of the folder.
 
-        `data` is where the file's content begins.
+        `data` and `end` are the offsets of the file's content and of the next header.
         """
         other = folder != self._folder
         if other:
             self._folder, self._first = folder, data
-        if other or 0 < self._beyond <= end:  # It was within a larger file.
+        if other or 0 < self._beyond <= end:  # The failed leap ended within a larger file.
             self._files = self._bytes = self._reach = self._beyond = 0
         self._files, self._bytes = self._files + 1, self._bytes + end - data
         size, name = self._bytes // self._files, folder.rpartition("/")[2]
@@ -145,7 +144,7 @@ class Leaps:
         return end
 
     def _sought(self, at: int, window: int) -> int:
-        """Return where a header of the folder lies in a window; 0 where none does."""
+        """Return the offset of a header of the folder in a window; 0 if there is none."""
         data, found = self._file.held(window, at), -1
         while (found := data.find(b"ustar", found + 1)) >= 0:
             begin = found - _MAGIC_AT
@@ -163,19 +162,19 @@ class Leaps:
 
 
 BLOCK = tarfile.BLOCKSIZE
-"""Bytes of a header, to a multiple of which members are filled up."""
+"""Size of a header [byte]; members are padded to a multiple of it."""
 
 MAX_KEPT = 2**27
-"""Bytes of a member that is kept; no reader takes a larger file."""
+"""Largest member [byte] that is kept; no reader takes a larger file."""
 
 _STREAMED = 2**23
-"""Bytes that an archive with gzip is read by."""
+"""Bytes per read of a gzip archive."""
 
 INCOMPLETE = "download it again"
 
 
 class Entry(NamedTuple):
-    """A member: where its data lies, and the CRC-32 of the header in front of that.
+    """A member: offset and size of its data [byte], and `check`, the CRC-32 of its header.
 
     `problem` says why it cannot be read; `link` is the member whose data it shares.
     """
@@ -195,11 +194,11 @@ class ArchiveError(Exception):
 def entries(
     file: ReadAhead, size: int, begin: int = 0, needed: Callable[[str], bool] | None = None
 ) -> Iterator[tuple[Entry | None, int]]:
-    """Yield the members of an archive from a header on, each with where the next one begins.
+    """Yield the members of an archive from a header on, each with the offset of the next header.
 
-    Folders are None; a name that leads out of the archive is empty. `begin` is 0, or where a
-    member said that the next one begins. Files of folders that are not `needed` may be left out
-    by `Leaps`. ArchiveError where the archive, of `size` bytes, is damaged or ends too early.
+    Folders are None; a name that leads out of the archive is empty. `begin` is 0, or an offset that
+    was yielded before. `Leaps` may skip files of folders that are not `needed`. ArchiveError if the
+    archive, of `size` bytes, is damaged or ends too early.
     """
     leaps = Leaps(file)
     file.seek(begin)
@@ -228,10 +227,10 @@ def entries(
 def unpack(
     file: io.RawIOBase, wanted: Callable[[str], bool], keep: Callable[[Entry, bytes], None]
 ) -> Iterator[tuple[Entry | None, int]]:
-    """Yield what `entries` does of an archive with gzip, read once from its beginning.
+    """Yield the members of a gzip archive, which is read once from its beginning.
 
-    Each comes with the bytes of the file that were read. `keep` gets the data of names that are
-    `wanted`, but for those larger than `MAX_KEPT`.
+    Each comes with the number of bytes read from the file. `keep` gets the data of members that
+    are `wanted` and not larger than `MAX_KEPT`.
     """
     stream = io.BufferedReader(file, _STREAMED)
     with _told(), tarfile.open(fileobj=stream, mode="r|gz", errors="surrogateescape") as archive:
@@ -258,7 +257,7 @@ def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:
     if not name:
         problem = repr(member.name)  # It leads out of the archive.
     elif member.islnk():
-        link = plain_name(member.linkname)  # Of the same archive, and before.
+        link = plain_name(member.linkname)  # It must come before, in the same archive.
         problem = "" if link else f"is a link to {member.linkname!r}"
     elif member.issym():
         problem = "is a symbolic link"
@@ -271,7 +270,7 @@ def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:
 
 @contextmanager
 def _told(fault: str = "is no intact tar archive") -> Iterator[None]:
-    """Turn what tarfile raises for damaged bytes into `ArchiveError`."""
+    """Turn errors of tarfile for damaged bytes into `ArchiveError`."""
     try:
         yield
     except (tarfile.TarError, EOFError, ValueError, zlib.error, gzip.BadGzipFile) as error:
@@ -280,7 +279,7 @@ def _told(fault: str = "is no intact tar archive") -> Iterator[None]:
 
 
 def plain_name(name: str) -> str:
-    """Return the name of a member as a path below a folder; empty if it could be none."""
+    """Return the name of a member as a path below a folder; empty if it leads elsewhere."""
     parts = [part for part in name.split("/") if part not in ("", ".")]
     if name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
         return ""

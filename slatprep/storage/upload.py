@@ -6,9 +6,9 @@ compares them.
 
 A version's name comes from its content and from the pointer that it replaces. A repeated upload
 therefore finds what the first one left. A process that removes a version's objects has replaced
-that pointer before, so this build's own replacement fails. Readers never see a partial store. Where
-workers of a cluster upload a version's large files themselves, its content is not known before. Its
-name is then new.
+that pointer before, so this build's own replacement fails. Readers never see a partial store. If
+workers of a cluster upload a version's large files, its content is not known in advance, and its
+name is random.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ from slatprep.storage.remote import (
 _SMALL_BYTES = 8 * 2**20
 
 _MD5 = re.compile(r"[0-9a-f]{32}(-[0-9]+)?")
-"""S3's tag of an object; after an upload in parts it has their number."""
+"""Pattern of S3's tag of an object; after an upload in parts it ends with their number."""
 
 
 @dataclass(frozen=True)
 class Staged:
     """Files of a version that are on the object store already: bytes and SHA-256 in hex by name.
 
-    Workers put some of them into `version`. The server is to copy the others, which are named in
+    Workers have put some of them into `version`. The server will copy the others, those in
     `copied`, from the version `before`.
     """
 
@@ -62,7 +62,7 @@ class Staged:
 
 @dataclass(frozen=True)
 class PublishedState:
-    """The pointer of a store at the beginning of a build, if any, and the server's tag of it."""
+    """The pointer of a store at the beginning of a build, if any, and the server's tag for it."""
 
     target: RemotePlace
     pointer: versions.Pointer | None
@@ -77,7 +77,7 @@ def published_state(target: RemotePlace) -> PublishedState:
     if versions.is_version(target):
         raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
     try:
-        # The tag first: if the pointer moves in between, the tag is the old one and will not match.
+        # Read the tag first: if the pointer moves in between, the old tag will not match.
         tag = str((target / versions.POINTER).entry().get("ETag", ""))
         pointer = versions.read_pointer(target)
         others = [] if pointer else [name for name in list_objects(target) if not _is_ours(name)]
@@ -123,7 +123,7 @@ class Upload:
             return
         keep = {self.pointer.version, self.pointer.previous}
         with writing(str(self.target), self.target):
-            # Before the pointer moves, so that builds which begin after that are not listed.
+            # List them before the pointer moves, so that later builds are not in the list.
             old = [name for name in list_objects(self.target) if _is_of_version(name, but=keep)]
             self._replace_pointer()
         reached("pointer replaced", str(self.target))
@@ -158,7 +158,7 @@ class Upload:
             if now == self.before.pointer:
                 raise
         now = versions.read_pointer(self.target)
-        # Ours, if the server's first answer was lost; or another build published the same content.
+        # It is ours if the server's answer was lost, or if another build has the same content.
         if now is None or now.version != self.pointer.version:
             raise StoreError(
                 f"{self.target}: another build replaced it while this one ran (at "
@@ -201,7 +201,7 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         put_objects(new, upload.version, small)
         put_objects(new, upload.version, large, at_once=1)
         if staged.before is not None:
-            # An upload may have left it already: a version's name implies its content.
+            # An earlier upload may have left some: a version's name implies its content.
             others = [n for n in staged.copied if there.get(n, {}).get("size") != sizes[n]]
             copy_objects(staged.before, upload.version, sorted(others))
         there = list_objects(upload.version)
@@ -218,9 +218,9 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
 
 
 def _is_tagged(entry: Mapping[str, Any], file: Path) -> bool | None:
-    """Whether an object's tag is the MD5 of a file, as S3 tags most; None if it is no MD5 at all.
+    """Return whether an object's tag is the MD5 of a file, as on S3; None if the tag is no MD5.
 
-    The object may equal the file even if not: where S3 encrypts, a tag is something else.
+    The object may equal the file even if the tag differs: S3 tags encrypted objects otherwise.
     """
     tag = str(entry.get("ETag", "")).strip('"')
     if not _MD5.fullmatch(tag):
@@ -228,20 +228,20 @@ def _is_tagged(entry: Mapping[str, Any], file: Path) -> bool | None:
     with file.open("rb") as content:
         if "-" not in tag:
             return tag == hashlib.file_digest(content, "md5").hexdigest()
-        # Of several parts: the MD5 of theirs.
+        # After an upload in parts, the tag is the MD5 of the parts' MD5 digests.
         parts = [hashlib.md5(part) for part in iter(partial(content.read, PART_BYTES), b"")]
     whole = hashlib.md5(b"".join(part.digest() for part in parts))
     return tag == f"{whole.hexdigest()}-{len(parts)}"
 
 
 def _is_ours(name: str) -> bool:
-    """Whether an object below a store is part of a version, its records or the spool."""
+    """Return whether an object below a store is part of a version, its records or the spool."""
     kind, _, rest = name.partition("/")
     return _is_of_version(name) or (kind == versions.SPOOL and versions.is_spooled(rest))
 
 
 def _is_of_version(name: str, but: Iterable[str] = ()) -> bool:
-    """Whether an object below a store is part of a version or its records."""
+    """Return whether an object below a store is part of a version or its records."""
     kind, _, rest = name.partition("/")
     own, kinds = rest.partition("/")[0], (versions.VERSIONS, versions.MANIFESTS)
     return kind in kinds and versions.is_version_name(own) and own not in but

@@ -4,8 +4,8 @@ Below the store's URL lie
 
 - ``current.json``, the pointer, which is replaced in one step;
 - ``versions/NAME/``, a store as on a disk, which never changes;
-- ``manifests/NAME/``, the records of the build that made it;
-- ``spool/``, the finished assets of the next one while a cluster builds it.
+- ``manifests/NAME/``, the records of the build that made this version;
+- ``spool/``, the finished assets of the next version while a cluster builds it.
 
 Plain zarr opens a version's own URL.
 """
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 POINTER, VERSIONS, MANIFESTS, SPOOL = "current.json", "versions", "manifests", "spool"
 
 BUILDER = "builder"
-"""Prefix of the spool's objects that say who builds."""
+"""Prefix of the spool's objects that name the process that builds."""
 
 FORMAT = "slatprep-store-pointer"
 
-# Whoever wrote the pointer chose the names, and they lead to objects.
+# Names are checked, because they lead to objects and a stranger may have written the pointer.
 _NAME = re.compile(r"[0-9a-f]{16}")
 _SPOOLED = re.compile(rf"{BUILDER}-[0-9a-f]{{16}}|[0-9a-f]{{2}}/[0-9a-f]{{64}}\.arrays")
 _MAX_POINTER_BYTES = 2**16
@@ -43,9 +43,9 @@ _MAX_POINTER_BYTES = 2**16
 class Pointer:
     """The content of a store's pointer.
 
-    `version` is the name of the one to read, `previous` that of the one before, kept for its
-    readers, or empty. `content` is the SHA-256 in hex over names and content of the version's
-    files, `published` the time in UTC.
+    `version` is the name of the version to read. `previous` is the name of the version before,
+    which is kept for its readers, or empty. `content` is the SHA-256 in hex over names and content
+    of the version's files, `published` the time in UTC.
     """
 
     version: str
@@ -56,12 +56,12 @@ class Pointer:
     format_version: int = 1
 
     def encode(self) -> bytes:
-        """Return the bytes of its file."""
+        """Return the content of the pointer's file."""
         return json.dumps(asdict(self), indent=2).encode() + b"\n"
 
     @classmethod
     def decode(cls, data: bytes) -> Pointer:
-        """Read a pointer's bytes; ValueError if they are none or have wrong names."""
+        """Read a pointer from bytes; ValueError if they are no pointer or have wrong names."""
         document = json.loads(data)
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise ValueError(f"no {FORMAT}")
@@ -78,7 +78,7 @@ class Pointer:
 
 
 def read_pointer(store: RemotePlace) -> Pointer | None:
-    """Read which version of a store is current; None without a pointer.
+    """Read the pointer of a store; return None if it has none.
 
     Raises OSError if it cannot be reached, StoreError if it is not a pointer.
     """
@@ -97,7 +97,7 @@ def read_pointer(store: RemotePlace) -> Pointer | None:
 
 
 def content_of(digests: Mapping[str, str]) -> str:
-    """Return a pointer's `content` for a version with files of these SHA-256."""
+    """Return a pointer's `content` for a version, from the SHA-256 of its files by name."""
     lines = "".join(f"{name} {digests[name]}\n" for name in sorted(digests))
     return hashlib.sha256(lines.encode()).hexdigest()
 
@@ -118,17 +118,17 @@ def current_version(store: RemotePlace) -> RemotePlace:
 
 
 def is_version(place: Place) -> bool:
-    """Whether a place is a version of a store."""
+    """Return whether a place is a version of a store."""
     return place.parent.name == VERSIONS and is_version_name(place.name)
 
 
 def new_version(store: RemotePlace) -> RemotePlace:
-    """Return the place of a version whose content is not known yet: its name is new."""
+    """Return the place of a version whose content is not known yet; its name is random."""
     return store / VERSIONS / secrets.token_hex(8)
 
 
 def is_spooled(name: str) -> bool:
-    """Whether an object has the name of a spooled one."""
+    """Return whether a name is that of a spooled object."""
     return _SPOOLED.fullmatch(name) is not None
 
 
@@ -138,5 +138,5 @@ def store_name(place: Place) -> str:
 
 
 def is_version_name(name: str) -> bool:
-    """Whether a version may have this name."""
+    """Return whether a version may have this name."""
     return _NAME.fullmatch(name) is not None
