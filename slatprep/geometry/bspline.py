@@ -2,8 +2,8 @@
 
 A displacement u(x) = sum_ijk B(a - i) B(b - j) B(c - k) C_ijk, where (a, b, c)
 is x in units of the lattice's spacing: 64 control points move each point.
-Coefficients are (n0, n1, n2, 3); the splines' domain is the n - 3 spans of each
-axis, and a point beyond it is displaced as the nearest point of the domain is.
+Coefficients are (n0, n1, n2, 3). The splines' domain is the n - 3 spans of each
+axis. A point outside has the displacement of the domain's nearest point.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def _axis_weights(position, spans, weights, at):  # type: ignore[no-untyped-def]
 def locate(point, origin, spacing, shape, weights):  # type: ignore[no-untyped-def]
     """Write the weights (12,) of a point along the axes; return its first coefficient's index.
 
-    The index counts numbers of the flattened coefficients. It is unsigned, so
-    that no negative index has to be provided for in the loops below.
+    The index counts numbers of the flattened coefficients. It is unsigned, so that
+    the compiler need not handle negative indices in the loops below.
     """
     first = 0
     for axis in range(3):
@@ -47,7 +47,7 @@ def locate(point, origin, spacing, shape, weights):  # type: ignore[no-untyped-d
 def gather(flat, first, strides, weights):  # type: ignore[no-untyped-def]
     """Return the displacement of a point: its coefficients, weighted and added up.
 
-    Written out by coordinate, as the compiler then uses vector instructions.
+    The sums are written out by coordinate, so that the compiler vectorises them.
     """
     plane, line = strides[0], strides[1]
     x0 = x1 = x2 = x3 = y0 = y1 = y2 = y3 = z0 = z1 = z2 = z3 = 0.0
@@ -106,7 +106,7 @@ def scatter(flat, first, strides, weights, x, y, z):  # type: ignore[no-untyped-
 
 @kernel()
 def strides_of(shape):  # type: ignore[no-untyped-def]
-    """Return how many numbers lie from one plane, and from one line, to the next."""
+    """Return the strides, in numbers, from plane to plane and from line to line."""
     return np.uint64(3 * shape[1] * shape[2]), np.uint64(3 * shape[2])
 
 
@@ -122,7 +122,7 @@ def displacements(points, origin, spacing, coefficients, out):  # type: ignore[n
 
 @kernel()
 def _axis_slopes(position, spans, slopes, at):  # type: ignore[no-untyped-def]
-    """Derivatives, in 1 / span, of the four weights; 0 beyond the domain."""
+    """Write the derivatives [1 / span] of the four weights; 0 outside the domain."""
     if position < 0.0 or position > spans:
         slopes[at : at + 4] = 0.0
         return
@@ -154,8 +154,8 @@ def refined(coefficients: Array) -> Array:
     """Return the coefficients of the same displacement on a lattice of half the spacing."""
     for axis in range(3):
         c = np.moveaxis(coefficients, axis, 0)
-        # A control point on an old one, and one between two (knot insertion);
-        # the outermost between-points serve no span and are not needed.
+        # Knot insertion: new control points lie on the inner old ones and halfway between
+        # old ones. New points on the outermost old ones serve no span.
         fine = np.empty((2 * len(c) - 3, *c.shape[1:]))
         fine[1::2] = (c[:-2] + 6.0 * c[1:-1] + c[2:]) / 8.0
         fine[0::2] = (c[:-1] + c[1:]) / 2.0
@@ -165,10 +165,10 @@ def refined(coefficients: Array) -> Array:
 
 @kernel()
 def bend(coefficients, strength, out):  # type: ignore[no-untyped-def]
-    """Add `strength` times the gradient (halved) of the bending energy to `out`.
+    """Add `strength` times half the gradient of the bending energy to `out`.
 
-    The energy is the sum over the lattice of all squared second differences,
-    mixed ones twice; it is zero for affine displacements and for no others.
+    The energy is the sum over the lattice of all squared second differences, with
+    mixed ones counted twice. It is zero for affine displacements only.
     """
     n0, n1, n2, _ = coefficients.shape
     flat, to = coefficients.reshape(-1), out.reshape(-1)

@@ -1,9 +1,9 @@
-"""The map between the frames: a similarity, and a deformation where one was earned.
+"""The map between the frames: a similarity, and a deformation if one was earned.
 
-The way from the SLAT frame to the PixieVerse frame is explicit, as it is the
-one of the lookup: deform, then apply the inverse of the transform. The way back
-solves for the point by Newton's method. The compiled part is imported where points are bent,
-as Numba takes as long to load as all else that reads a store.
+The map from the SLAT frame to the PixieVerse frame is explicit, as the lookup uses it: deform, then
+apply the inverse of the transform. The map back solves for the point by Newton's method. The
+compiled part is imported only to bend points, as Numba takes as long to load as everything else
+that reads a store.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from slatprep.geometry.frames import apply_transform, invert_transform, voxel_ce
 from slatprep.records import RESOLUTION, Alignment, Deformation
 
 GRAIN = 2.0**-30
-"""All numbers of a deformation are multiples of this: exact in JSON, 6e-8 voxel."""
+"""Step of all numbers of a deformation: exact in JSON, and 6e-8 voxel as a length."""
 
 LEAST_STRETCH, MOST_STRETCH = 0.6, 1.6
-"""Singular values of an affine part lie within these."""
+"""Limits of the singular values of an affine part."""
 
 _NEWTON_STEPS = 30
 _CLOSE = 1e-9  # edges of the unit cube
@@ -33,8 +33,8 @@ _SHRINK, _SHRINKS = 0.8, 20
 class PlaceMap:
     """The map between the PixieVerse frame and the SLAT frame, both ways.
 
-    ``transform`` is (4, 4), PixieVerse frame to SLAT frame, a similarity;
-    ``deformation`` is None where that is all.
+    ``transform`` (4, 4) is a similarity from the PixieVerse frame to the SLAT frame.
+    ``deformation`` is None if the similarity is the whole map.
     """
 
     transform: NDArray[np.float64]
@@ -57,22 +57,22 @@ class PlaceMap:
     def places(
         self, coords: NDArray[np.integer], resolution: int = RESOLUTION
     ) -> NDArray[np.float64]:
-        """Return where SLAT voxels (N, 3), of a grid of this resolution, lie in PixieVerse's."""
+        """Return the PixieVerse positions (N, 3) of SLAT voxels in a grid of `resolution`."""
         return self.to_pixieverse(voxel_centres(coords, resolution))
 
 
 def map_of(alignment: Alignment) -> PlaceMap:
-    """Return the map between the frames that an alignment stands for.
+    """Return the map between the frames that an alignment describes.
 
     Parameters
     ----------
     alignment : Alignment
-        What `slatprep.align_voxels` found, or a record holds.
+        An alignment from `slatprep.align_voxels` or from a record.
 
     Returns
     -------
     PlaceMap
-        Its transform, and its deformation where there is one.
+        The map of its transform and, if it has one, its deformation.
     """
     return PlaceMap(alignment.transform, alignment.deformation)
 
@@ -80,8 +80,8 @@ def map_of(alignment: Alignment) -> PlaceMap:
 def deform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
     """Apply a deformation to points (N, 3) of the SLAT frame.
 
-    Beyond the splines' domain the displacement of its nearest point is added to
-    the affine part.
+    Outside the splines' domain, the displacement of the domain's nearest point is
+    added to the affine part.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     affine = deformation.affine
@@ -110,10 +110,11 @@ def jacobian(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]
 
 
 def undeform(deformation: Deformation, points: ArrayLike) -> NDArray[np.float64]:
-    """Return the points (N, 3) that `deform` takes to these, of a deformation that does not fold.
+    """Return the points (N, 3) that `deform` maps to `points`, if the deformation does not fold.
 
-    To 1e-9 of the cube's edge. Where Newton's method does not settle within 30 steps, which is
-    possible only beyond the splines' domain, where the derivative jumps, the nearest it came.
+    The error is at most 1e-9 of the cube's edge. If Newton's method does not settle within 30
+    steps, the closest points found are returned. This is possible only outside the splines' domain,
+    where the derivative jumps.
     """
     target = np.asarray(points, dtype=np.float64)
     affine = deformation.affine
@@ -146,11 +147,11 @@ def make_deformation(
 ) -> Deformation | None:
     """Make a deformation that is bounded and does not fold, rounded to `GRAIN`.
 
-    Arguments are as `Deformation` has them; `points` (N, 3) are the SLAT's. Neither the affine part
-    nor the bending moves one of them farther than `max_displacement` (voxels): coefficients are
-    shortened to it, and a spline lies in the convex hull of its coefficients. Bending is shrunk
-    until `is_proper` holds. None where the affine part stretches or moves too far, or no shrinking
-    helps.
+    Arguments are those of `Deformation`; `points` (N, 3) are the SLAT's. Neither the affine part
+    nor the bending moves a point farther than `max_displacement` (voxels). Coefficients are
+    shortened to it, as a spline lies in the convex hull of its coefficients. Bending is shrunk
+    until `is_proper` holds. Return None if the affine part stretches or moves too far, or if no
+    shrinking helps.
     """
     made = Deformation(
         _rounded(affine), _rounded(origin), float(_rounded(spacing)), _rounded(coefficients)
@@ -167,7 +168,7 @@ def make_deformation(
     if not made.coefficients.size:
         return made
     length = np.linalg.norm(made.coefficients, axis=-1, keepdims=True)
-    # Slightly less, so that rounding does not lead beyond the bound.
+    # Slightly less, so that rounding does not exceed the bound.
     shorter = np.minimum(1.0, (1.0 - 1e-6) * limit / np.maximum(length, 1e-12))
     made = replace(made, coefficients=_rounded(made.coefficients * shorter))
     for _ in range(_SHRINKS):
@@ -178,12 +179,11 @@ def make_deformation(
 
 
 def is_proper(deformation: Deformation) -> bool:
-    """Say whether a deformation is certain not to fold anywhere in the splines' domain.
+    """Return whether a deformation certainly does not fold anywhere in the splines' domain.
 
-    The smallest singular value of the derivative is bounded from below by
-    2 det / |J|^2 (Frobenius) on a grid of two points a span, or four; between
-    those it falls by no more than the largest second derivative, which the
-    second differences of the coefficients bound, times the way.
+    On a grid of two or four points per span, 2 det / |J|^2 (Frobenius) is a lower bound of the
+    derivative's smallest singular value. Between grid points it falls by at most the distance times
+    the largest second derivative, which the second differences of the coefficients bound.
     """
     c, spacing = deformation.coefficients, deformation.spacing
     if not c.size:
@@ -193,8 +193,8 @@ def is_proper(deformation: Deformation) -> bool:
 
 
 def _least_stretch(deformation: Deformation, steps: int) -> float:
-    """Return the least of 2 det / |J|^2 over a grid of `steps` points a span."""
-    # In units of spans, so that rounding leads none of them out of the domain.
+    """Return the minimum of 2 det / |J|^2 over a grid of `steps` points per span."""
+    # Points are in units of spans, so that rounding moves none of them out of the domain.
     spans = replace(deformation, affine=np.zeros((3, 4)), origin=np.zeros(3), spacing=1.0)
     at = [np.arange(steps * (n - 3) + 1) / steps for n in deformation.coefficients.shape[:3]]
     points = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -214,7 +214,7 @@ def bending_of(deformation: Deformation) -> float:
 def _second_derivative(
     coefficients: NDArray[np.float64], over: Callable[[NDArray[np.float64]], np.floating[Any]]
 ) -> float:
-    """Return the Frobenius norm, in 1 / spacing^2, of squared differences `over` the lattice."""
+    """Return the Frobenius norm [1 / spacing^2] of second differences, reduced by `over`."""
     squares = 0.0
     for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):
         second = np.diff(np.diff(coefficients, axis=a), axis=b)
@@ -224,5 +224,5 @@ def _second_derivative(
 
 def _rounded(values: ArrayLike) -> NDArray[np.float64]:
     rounded: NDArray[np.float64] = np.round(np.asarray(values, dtype=np.float64) / GRAIN) * GRAIN
-    # Minus zero would be another byte in JSON.
+    # JSON writes -0.0 and 0.0 differently; the sum is never -0.0.
     return rounded + 0.0

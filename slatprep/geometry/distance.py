@@ -2,10 +2,10 @@
 
 The squared distance to a set separates by axis (Felzenszwalb and Huttenlocher,
 "Distance Transforms of Sampled Functions", 2012): the distance along one axis
-is a running count, and each further axis takes the least of ``f(i') + (i - i')^2``.
-Near a surface the least is found within a few voxels, and several rows are
-searched at once in 16-bit integers, which beats the lower envelope of parabolas
-of the packages at this size threefold.
+is a running count, and each further axis takes the minimum of ``f(i') + (i - i')^2``.
+Near a surface the minimum lies within a few voxels, and several rows are searched at
+once in 16-bit integers. At this size that is three times as fast as the lower envelope
+of parabolas of the packages.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from numpy.typing import NDArray
 from slatprep.geometry.kernel import kernel
 
 LARGEST_SIDE = 72
-"""Longest side of a box: three squares of it still fit the integers used."""
+"""Longest side of a box, in voxels: three squares of it still fit into 16 bits."""
 
 NOTHING = 127
-"""Stands for "nothing of the other kind in this line".
+"""Distance that stands for "no voxel of the other kind in this line".
 
-Its square exceeds every squared distance in a box that the solid touches on all
-sides, or within a slab of such a box, and may be added to one.
+Its square exceeds every squared distance in a box that the solid touches on all sides, and in a
+slab of such a box. The sum of both still fits into 16 bits.
 """
 
 _VECTOR, _ROWS = 16, 8
-"""How many 16-bit integers a processor takes at once, and rows that are searched together."""
+"""Number of 16-bit integers in a processor's vector, and of rows that are searched together."""
 
 
 def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the distance (a, b, c), in voxels, of each voxel's centre to the faces of a solid.
 
-    It is Euclidean, to the nearest voxel centre of the other kind, less half a voxel; negative
-    inside. What lies outside the box is not looked at. ValueError if a side is beyond
+    It is the Euclidean distance to the nearest voxel centre of the other kind, less half a voxel,
+    and negative inside. Space outside the box is ignored. Raise ValueError if a side exceeds
     `LARGEST_SIDE`.
     """
     if max(solid.shape) > LARGEST_SIDE:
         raise ValueError(f"a side is at most {LARGEST_SIDE} voxels, got shape {solid.shape}")
     solid = np.ascontiguousarray(solid)
-    # Lines of whole vectors; what is added to them is as near as can be, and so not searched for.
+    # Lines are padded to whole vectors; the padding has distance 0 and needs no search.
     length = -(-solid.shape[2] // _VECTOR) * _VECTOR
     inside, outside = np.zeros((2, *solid.shape[:2], length), dtype=np.int16)
     _squares_along_last(solid, inside, outside)
@@ -52,7 +52,7 @@ def signed_distance(solid: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 @kernel()
 def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
-    """Squared distance within each line to the nearest voxel of the other kind, into zeros."""
+    """Write to zeros the squared distance, in its line, to the nearest voxel of the other kind."""
     length = solid.shape[2]
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):
@@ -60,7 +60,7 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
             for end in range(1, length + 1):
                 if end < length and line[end] == line[end - 1]:
                     continue
-                # From `begin` to `end` all are of a kind; the next of the other one lie there.
+                # All voxels from `begin` to `end` are of one kind; the other kind is next to them.
                 before = begin - 1 if begin > 0 else -NOTHING
                 after = end if end < length else length + NOTHING
                 into = inside[i, j, begin:end] if line[begin] else outside[i, j, begin:end]
@@ -72,8 +72,8 @@ def _squares_along_last(solid, inside, outside):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _spread_over_others(squares):  # type: ignore[no-untyped-def]
-    """Take the two axes before the last into account, in place, slab by slab."""
-    # Copied by loops, which become vector instructions: an assignment of slices does not.
+    """Extend squared distances to the two axes before the last, in place, slab by slab."""
+    # Loops copy the lines, as the compiler does not vectorise an assignment of slices.
     a, b, c = squares.shape
     slab, least = padded(a, c), np.empty(a * c, np.int16)
     for j in range(b):
@@ -85,7 +85,7 @@ def _spread_over_others(squares):  # type: ignore[no-untyped-def]
                 to[k] = line[k]
                 largest = largest if largest > line[k] else line[k]
         if smallest == NOTHING * NOTHING or largest == 0:
-            continue  # Nothing of the other kind in any of its lines, or nothing else.
+            continue  # None of the voxels is of the other kind, or all are.
         spread(slab, least, c)
         for i in range(a):
             own, line = least[i * c :], squares[i, j]
@@ -104,7 +104,7 @@ def _spread_over_others(squares):  # type: ignore[no-untyped-def]
 
 @kernel()
 def padded(rows, columns):  # type: ignore[no-untyped-def]
-    """Return memory for a flattened slab, with as many rows of nothing before and behind it."""
+    """Return an array for a flattened slab, with as many rows of `NOTHING` before and after it."""
     return np.full(3 * rows * columns, NOTHING * NOTHING, np.int16)
 
 
@@ -112,8 +112,8 @@ def padded(rows, columns):  # type: ignore[no-untyped-def]
 def spread(slab, least, columns):  # type: ignore[no-untyped-def]
     """Set ``least[i, k]`` to the minimum over i' of ``slab[i', k] + (i - i')^2``.
 
-    Both are flattened, and the slab is `padded`. Comparisons are spelled out and 16 bits wide, and
-    slices have no end, so that they become vector instructions, of `_ROWS` rows at a time.
+    Both are flattened, and the slab is `padded`. `_ROWS` rows are searched at a time. Comparisons
+    are written out in 16 bits, and slices have no end, so that the compiler vectorises them.
     """
     size = len(least)
     for first in range(0, size, _ROWS * columns):
@@ -144,7 +144,7 @@ def _signed(solid, inside, outside, distance):  # type: ignore[no-untyped-def]
     for i in range(solid.shape[0]):
         for j in range(solid.shape[1]):
             for k in range(solid.shape[2]):
-                # One of the two is 0.
+                # One of the two squares is 0.
                 apart = np.sqrt(np.float32(inside[i, j, k] + outside[i, j, k])) - np.float32(0.5)
                 distance[i, j, k] = -apart if solid[i, j, k] else apart
 
@@ -153,7 +153,7 @@ def _signed(solid, inside, outside, distance):  # type: ignore[no-untyped-def]
 def near_surface(distance, band):  # type: ignore[no-untyped-def]
     """Return the lattice points (M, 3) within `band` voxels of a surface, and their distances (M,).
 
-    In C order; of the points a column lies after the other in memory.
+    Points are in C order, and each of their columns is contiguous in memory.
     """
     limit = np.float32(band)
     lines = np.zeros(distance.shape[:2], np.int64)

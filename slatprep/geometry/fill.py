@@ -1,7 +1,7 @@
-"""Find what lies outside a voxel set, 64 voxels at a time.
+"""Find the space outside a voxel set, 64 voxels at a time.
 
-A line of the grid along its last axis is one 64-bit word, so that a flood runs
-along a line in six steps and from line to line in one.
+A line of the grid along its last axis is one 64-bit word. So a flood runs along a
+line in six steps, and from line to line in one.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 from slatprep.geometry.kernel import kernel
 
 WORD = 64
-"""Longest line that fits a word."""
+"""Longest line, in voxels, that fits into a word."""
 
 
 def outside_of(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the empty voxels that a path over faces joins with the outside of a grid (a, b, c).
+    """Return the empty voxels that a path over faces connects to the outside of a grid (a, b, c).
 
-    ValueError if c is above 64, as a line is a word.
+    Raise ValueError if c is above 64, as a line is a word.
     """
     a, b, c = occupancy.shape
     if c > WORD:
         raise ValueError(f"the last axis is at most {WORD} long, got shape {occupancy.shape}")
-    # What a line lacks to a word is occupied: no flood enters it.
+    # The bits of a word beyond its line are occupied, so that no flood enters them.
     lines = np.ones((a, b, WORD), dtype=bool)
     lines[..., :c] = occupancy
-    # Of the flattened grid, as numpy packs one line far faster than many.
+    # The grid is flattened, as numpy packs one line far faster than many.
     free = ~np.packbits(lines.reshape(-1), bitorder="little").view("<u8").astype(np.uint64)
     flooded = _flood(free.reshape(a, b), np.uint64(1 | 1 << (c - 1))).astype("<u8")
     bits = np.unpackbits(flooded.view(np.uint8).reshape(-1), bitorder="little")
@@ -35,7 +35,7 @@ def outside_of(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @kernel()
 def _flood(free, ends):  # type: ignore[no-untyped-def]
-    """Flood `free` from the grid's faces; sweeps go to and fro until nothing changes."""
+    """Flood `free` from the grid's faces, by forward and backward sweeps until nothing changes."""
     rows, columns = free.shape
     flooded = np.zeros_like(free)
     changed, forward = True, True
@@ -62,7 +62,7 @@ def _flood(free, ends):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _along_line(seeds, free):  # type: ignore[no-untyped-def]
-    """Spread set bits over adjacent free ones both ways, the step doubling (Kogge and Stone)."""
+    """Spread set bits over adjacent free bits both ways, in doubling steps (Kogge and Stone)."""
     up, down = seeds, seeds
     way_up, way_down = free, free
     for exponent in range(6):

@@ -73,13 +73,13 @@ def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float
     """
     matrix = _homogeneous(transform)
     mapped: NDArray[np.float64] = np.asarray(points, dtype=np.float64) @ matrix[:3, :3].T
-    for axis in range(3):  # Along narrow rows numpy takes five times as long.
+    for axis in range(3):  # numpy takes five times as long along narrow rows.
         mapped[..., axis] += matrix[axis, 3]
     return mapped
 
 
 def _homogeneous(transform: ArrayLike) -> NDArray[np.float64]:
-    """Return a transform as a matrix (4, 4); ValueError if it is none that multiplies columns."""
+    """Return a transform as a matrix (4, 4); raise ValueError if it does not multiply columns."""
     matrix = np.asarray(transform, dtype=np.float64)
     if matrix.shape != (4, 4):
         raise ValueError(f"a transform is a finite 4x4 matrix, got shape {matrix.shape}")
@@ -109,7 +109,7 @@ def split_transform(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Split a similarity transform into rotation (3, 3), translation (3,) and scale.
 
-    ValueError if the matrix is not 4x4, not finite, mirrors, or is no similarity.
+    Raise ValueError if the matrix is not 4x4, not finite, mirrors, or is no similarity.
     """
     if not np.isfinite(transform).all():
         raise ValueError("a transform is a finite 4x4 matrix, got NaN or an infinity")
@@ -127,7 +127,7 @@ def split_transform(
 
 
 def invert_transform(transform: ArrayLike) -> NDArray[np.float64]:
-    """Return the inverse of a similarity transform (4, 4); ValueError as `split_transform`."""
+    """Return the inverse of a similarity transform (4, 4); raise as `split_transform` does."""
     rotation, translation, scale = split_transform(transform)
     linear = rotation.T / scale
     return make_transform(linear, -linear @ translation)
@@ -139,7 +139,7 @@ def places_of(points: ArrayLike, transform: ArrayLike) -> NDArray[np.float64]:
 
 
 def displacement(transform: ArrayLike, reference: ArrayLike, points: ArrayLike) -> float:
-    """Mean distance, in voxels, between where two transforms (4, 4) look points (N, 3) up.
+    """Return the mean distance [voxel] of SLAT points (N, 3), mapped back by two transforms (4, 4).
 
     Both are inverted, so the distance is measured in the PixieVerse frame, where the annotation
     lies.
@@ -151,9 +151,9 @@ def displacement(transform: ArrayLike, reference: ArrayLike, points: ArrayLike) 
 def nearest_similarity(
     source: NDArray[np.floating[Any]], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the similarity (4, 4) that maps points (P, 3) onto others with least squares.
+    """Return the similarity (4, 4) that maps points (P, 3) onto others by least squares.
 
-    At least three of them are not on a line. S. Umeyama, "Least-squares estimation of
+    At least three of the points must not lie on a line. S. Umeyama, "Least-squares estimation of
     transformation parameters between two point patterns", IEEE TPAMI 13(4), 1991.
     """
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)

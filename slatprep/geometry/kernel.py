@@ -1,4 +1,4 @@
-"""Numba's compiler, as all kernels are compiled."""
+"""Numba's compiler with the settings of all kernels."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ def _can_be_kept() -> bool:
 
 
 KEPT = _can_be_kept()
-"""Whether there is a folder in which compiled code can be kept for the next process.
+"""Whether compiled code can be cached for the next process.
 
-Numba takes the first that can be written to of NUMBA_CACHE_DIR, ``__pycache__``
-beside the source and the user's cache, and refuses to cache where there is none,
-as in a container whose root is read-only.
+Numba uses the first writable folder of NUMBA_CACHE_DIR, ``__pycache__`` beside the source, and the
+user's cache. It refuses to cache if there is none, as in a container with a read-only root.
 """
 
 kernel = partial(njit, cache=KEPT)

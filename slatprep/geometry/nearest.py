@@ -1,10 +1,9 @@
-"""The nearest voxel of a set, exactly and fast, for points that lie close to it.
+"""Find the nearest voxel of a set, exactly and fast, for points close to it.
 
-A kd-tree spends most of its time being built. Voxels lie on a lattice, so the
-cells around a point, taken in order of how near they can be, find the same
-voxel after a few look-ups. Where there are none that near, whole columns are
-looked at, in slabs that can hold a nearer one alone: that is fast even for
-points that are all far off.
+A kd-tree spends most of its time on being built. Voxels lie on a lattice, so a search of the cells
+around a point, nearest first, finds the same voxel after a few reads. If no voxel is that near,
+whole columns are searched, but only in slabs that can hold a nearer voxel. This is fast even if all
+points are far away.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from slatprep.geometry.distance import NOTHING, padded, spread
 from slatprep.geometry.kernel import kernel
 from slatprep.records import RESOLUTION
 
-_REACH = 3  # voxels searched by cells before columns are
-_SURE = _REACH + 0.5  # beyond the cells voxels are this far off, or farther
-_BEYOND = 1.5  # voxels in other than the 27 cells around a point are this far off, or farther
-_BLOCK = 4  # cells a side of what is passed over at once
-_ROUNDING = 1e-6  # voxels by which a bound is loosened, so that no rounding passes over a voxel
+_REACH = 3  # voxels; reach of the search by cells, which precedes that by columns
+_SURE = _REACH + 0.5  # voxels; smallest distance of a voxel beyond these cells
+_BEYOND = 1.5  # voxels; smallest distance of a voxel outside the 27 cells around a point
+_BLOCK = 4  # cells along an edge of a block, which is skipped as a whole
+_ROUNDING = 1e-6  # voxels; slack of a bound, so that rounding skips no voxel
 
 
 class Lattice:
-    """A set of voxels (K, 3), K >= 1, that knows which row each cell of the grid belongs to."""
+    """A set of voxels (K, 3), K >= 1, with the row of the voxel in each cell of the grid."""
 
     def __init__(self, voxels: NDArray[np.uint8]) -> None:
         if len(voxels) == 0:
@@ -44,15 +43,15 @@ class Lattice:
     ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
         """Return distance (N,) [voxel] and row (N,) of the nearest voxel of points (N, 3).
 
-        Points may lie outside the cube. The first of several equally near voxels counts. The
-        distance is infinite, and the row -1, where it exceeds `limit` (voxels).
+        Points may lie outside the cube. The first of several equally near voxels counts. If the
+        distance exceeds `limit` (voxels), it is infinite and the row is -1.
         """
         # In index units, where voxel i is centred at i.
         position = np.ascontiguousarray((np.asarray(points, np.float64) + 0.5) * RESOLUTION - 0.5)
         near = self._blocks_near(min(limit, _SURE))
         distance, nearest = _search(position, self._row, near, *_cells(), float(limit) ** 2)
         if limit >= _SURE:
-            # Of a usual asset few points lie so far off that their cells cannot tell.
+            # In a usual asset few points are too far away for the search by cells.
             far = np.flatnonzero(~(distance < _SURE))
             if len(far):
                 below, above, apart = _columns(self._row)
@@ -62,9 +61,9 @@ class Lattice:
         return distance, nearest
 
     def _blocks_near(self, reach: float) -> NDArray[np.bool_]:
-        """Return the blocks of cells that may have a voxel within a reach; far off none need look.
+        """Return the blocks of cells that may have a voxel within `reach`; others are skipped.
 
-        A set that fills the grid, looked up in one that does not, has mostly such points.
+        If a set that fills the grid is looked up in a smaller one, most points are skipped.
         """
         if reach not in self._near:
             near = self._near[reach] = self._blocks.copy()
@@ -84,11 +83,12 @@ class Lattice:
         most: float,
         limit: float = np.inf,
     ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.bool_]]:
-        """Return what `nearest` does, but of the voxel that a vote chooses; and what was near (N,).
+        """Return distance and row as `nearest`, but of a voxel chosen by vote, and `near` (N,).
 
-        Near is a point whose nearest voxel is `most` voxels away or less. Around it the voxels in
-        27 cells vote for their label (K,) with the weight exp(-d^2 / 2 width^2), d their distance
-        in voxels; the lower label wins a draw. The nearest voxel of the winning label is chosen.
+        A point is near if its nearest voxel is at most `most` voxels away. The voxels in the 27
+        cells around it vote for their label (K,) with the weight exp(-d^2 / 2 width^2), where d is
+        their distance in voxels. The lower label wins a draw. The nearest voxel of the winning
+        label is chosen.
         """
         distance, nearest = self.nearest(points, limit)
         near = distance <= most
@@ -102,19 +102,19 @@ class Lattice:
 
 @lru_cache(maxsize=1)
 def _cells() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Cell offsets by the smallest squared distance that a voxel in them can have."""
+    """Return cell offsets and the smallest squared distance of a voxel in each, in that order."""
     axis = np.arange(-_REACH, _REACH + 1)
     offsets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     floors = (np.maximum(np.abs(offsets) - 0.5, 0.0) ** 2).sum(axis=1)
     order = np.argsort(floors, kind="stable")
-    # Cells beyond the reach may be as near as this; nothing farther is sure.
+    # Voxels beyond the reach may be as near as `_SURE`, so no farther cell can be sure.
     sure = floors[order] <= _SURE**2
     return offsets[order][sure].astype(np.int64), floors[order][sure]
 
 
 @kernel()
 def _number(voxels, row, blocks):  # type: ignore[no-untyped-def]
-    """Write the number of each voxel to its cell, and which blocks of cells have any."""
+    """Write the row of each voxel to its cell, and mark the blocks that have voxels."""
     for m in range(len(voxels)):
         a, b, c = voxels[m, 0], voxels[m, 1], voxels[m, 2]
         row[a, b, c] = m
@@ -135,14 +135,14 @@ def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-unt
             continue
         aside = max(abs(x - a), abs(y - b), abs(z - c))
         if aside < 0.5 - _ROUNDING and inside == (a, b, c) and row[a, b, c] >= 0:
-            # A point in a voxel of the set is nearer to its centre than to any other.
+            # If the point lies in a voxel of the set, this voxel is the nearest.
             square = (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
             if square <= limit:
                 distance[m], nearest[m] = np.sqrt(square), row[a, b, c]
             continue
         best, found = np.inf, -1
         for n in range(offsets.shape[0]):
-            # Equality goes on: an equally near voxel may have the lower row.
+            # Equality does not end the search: an equally near voxel may have a lower row.
             if floors[n] > best or floors[n] > limit:
                 break
             i, j, k = a + offsets[n, 0], b + offsets[n, 1], c + offsets[n, 2]
@@ -161,11 +161,11 @@ def _search(position, row, near, offsets, floors, limit):  # type: ignore[no-unt
 
 @kernel()
 def _columns(row):  # type: ignore[no-untyped-def]
-    """For each cell the next voxels of its column (a line along the last axis), and of its slab.
+    """Return for each cell the next voxels of its column (along the last axis) and of its slab.
 
-    Returns the place in the column of the last voxel that does not come after the cell, and of
-    the first that does not come before it, -1 for none; and the squared distance to the nearest
-    voxel with the same first index, at least the square of `NOTHING` for none.
+    The first two arrays have the column index of the last voxel at or before the cell, and of the
+    first at or after it; -1 for none. The third has the squared distance to the nearest voxel with
+    the same first index. It is at least the square of `NOTHING` if there is none.
     """
     below, above = np.full(row.shape, -1, np.int8), np.full(row.shape, -1, np.int8)
     size = row.shape[0]
@@ -174,7 +174,7 @@ def _columns(row):  # type: ignore[no-untyped-def]
     for i in range(size):
         for j in range(size):
             slab[j, :] = NOTHING * NOTHING
-            if row[i, j].max() < 0:  # as of most lines
+            if row[i, j].max() < 0:  # true for most lines
                 continue
             last, after = -1, -1
             for k in range(size):
@@ -193,7 +193,7 @@ def _columns(row):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _search_columns(position, row, below, above, apart, limit):  # type: ignore[no-untyped-def]
-    """Search slab after slab, column after column, from a point's own to both sides."""
+    """Search slab after slab, column after column, outwards from the point's own."""
     count, end = position.shape[0], row.shape[0] - 1
     distance = np.full(count, np.inf)
     nearest = np.full(count, -1, dtype=np.intp)
@@ -201,9 +201,9 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
         x, y, z = position[m, 0], position[m, 1], position[m, 2]
         v, w = min(max(y, 0.0), end), min(max(z, 0.0), end)
         a, b, c = int(np.rint(min(max(x, 0.0), end))), int(np.rint(v)), int(np.rint(w))
-        # Half-way between two cells either may hold the nearest.
+        # If the point is halfway between two cells, either may hold the nearest voxel.
         low, high = int(np.floor(w)), int(np.ceil(w))
-        # How far off the grid the point lies, and the cell that knows what its slab holds.
+        # The squared distance to the grid, and the distance to the cell whose `apart` is read.
         outside = (y - v) ** 2 + (z - w) ** 2
         aside = math.sqrt((v - b) ** 2 + (w - c) ** 2) + _ROUNDING
         best, found = limit, -1
@@ -238,18 +238,18 @@ def _search_columns(position, row, below, above, apart, limit):  # type: ignore[
 
 @kernel()
 def _alike_around(voxels, labels):  # type: ignore[no-untyped-def]
-    """Say of each cell of the grid with a margin of two whether all voxels around it agree.
+    """Return for each cell, with a margin of two, whether all voxels in 27 cells around agree.
 
-    Around it are the 27 cells; where none of them is in the set the answer means nothing.
+    The value has no meaning if none of the cells is in the set.
     """
     side = RESOLUTION + 4
     low, high = np.full(side**3, 255, np.uint8), np.zeros(side**3, np.uint8)
     for m in range(len(voxels)):
         a, b, c = voxels[m, 0] + 2, voxels[m, 1] + 2, voxels[m, 2] + 2
         low[(a * side + b) * side + c] = high[(a * side + b) * side + c] = labels[m]
-    # In flattened grids a neighbour is so many places on. What comes of the margin's far side is
-    # no neighbour, and lies in the margin, too. Each cell gets what lies from it on, so that at
-    # last a cell has those of the one that is as many places on as is the margin.
+    # In a flattened grid a neighbour lies at a fixed offset. Offsets that leave a line or a plane
+    # lead from margin to margin and do no harm. Each cell takes the values of itself and of the
+    # next two, so the result for a cell lies `margin` places before it.
     for step in (1, side, side * side):
         for k in range(side**3 - 2 * step):
             low[k] = min(low[k], low[k + step], low[k + 2 * step])
@@ -265,7 +265,7 @@ def _alike_around(voxels, labels):  # type: ignore[no-untyped-def]
 def _vote(  # type: ignore[no-untyped-def]
     points, near, row, labels, alike, n_labels, steepness, distance, index
 ):
-    """Write distance and row of the voxel that is chosen for each point that is near."""
+    """Write distance and row of the chosen voxel for each near point."""
     size = row.shape[0]
     nearest, nearest_square = np.zeros(n_labels, dtype=np.intp), np.zeros(n_labels)
     voter_label, voter_square = np.zeros(27, dtype=np.intp), np.zeros(27)

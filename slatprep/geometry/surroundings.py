@@ -1,4 +1,4 @@
-"""What the cells around points hold, in shells of directions; a compiled inner loop."""
+"""Measure how the cells around points are labelled, in shells; a compiled inner loop."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from slatprep.geometry.kernel import kernel
 from slatprep.records import RESOLUTION
 
 DIRECTIONS = 14
-"""Cells looked at in each shell: along the axes and the diagonals of space."""
+"""Number of cells in each shell: along the axes and the space diagonals."""
 
 
 def labelled(
     voxels: NDArray[np.uint8], labels: NDArray[np.uint8], reach: int, empty: int
 ) -> NDArray[np.uint8]:
-    """Return the labels (K,) of voxels (K, 3) by cell, in a grid with a margin; else `empty`."""
-    # Beyond twice the reach no cell of a shell lies in the grid.
+    """Return a grid of cells with a margin: the labels (K,) of voxels (K, 3), else `empty`."""
+    # With this margin the shells of points up to `reach` outside the grid stay in the array.
     cells = np.full((RESOLUTION + 4 * reach,) * 3, empty, dtype=np.uint8)
     _label(voxels, labels, 2 * reach, cells)
     return cells
@@ -31,12 +31,12 @@ def shares_around(
     radii: tuple[int, ...],
     empty: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Look at the cells at some distances of points (N, 3), and say how they are labelled.
+    """Return how the cells at some distances from points (N, 3) are labelled.
 
-    `cells` are of `labelled`, and no radius is above its reach. Each of the `radii` (voxels) is
-    a shell of `DIRECTIONS` cells, 0 the point's own. Returns shares (N, len(radii)): of the cells
-    that are not empty those whose label differs from the point's own, 0 where all are empty; and of
-    all cells those that are not empty.
+    `cells` come from `labelled`, and no radius is above its reach. Each of the `radii` (voxels) is
+    a shell of `DIRECTIONS` cells; 0 is the point's own cell. Return two arrays of shares (N,
+    len(radii)). The first is the share of non-empty cells whose label differs from the point's own,
+    0 if all are empty. The second is the share of all cells that are not empty.
     """
     directions = _directions() if any(radii) else [np.zeros(3)]
     steps = np.rint([[direction * radius for direction in directions] for radius in radii])
@@ -78,7 +78,7 @@ def _look(cells, points, labels, steps, side, empty):  # type: ignore[no-untyped
         for shell in range(steps.shape[0]):
             there, differ = 0, 0
             for n in range(steps.shape[1]):
-                # Unsigned, so that no negative index has to be provided for.
+                # Unsigned, so that the compiler need not handle negative indices.
                 label = cells[np.uint64(place + steps[shell, n])]
                 there += label != empty
                 differ += (label != empty) & (label != own)

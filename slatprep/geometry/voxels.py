@@ -12,11 +12,11 @@ from slatprep.records import RESOLUTION, Ground
 def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the occupied voxels of a grid (n, n, n) that touch an empty one by a face.
 
-    The outside of the grid counts as empty. They are the source points of the alignment in
-    SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
+    The outside of the grid counts as empty. These voxels are the source points of the alignment
+    in SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
     """
     padded = np.pad(np.ascontiguousarray(occupancy, dtype=bool), 1)
-    # In a flattened grid a neighbour is so many places on, which numpy looks at far faster.
+    # In a flattened grid a neighbour lies at a fixed offset, which numpy reads far faster.
     flat = padded.reshape(-1)
     buried = flat.copy()
     for step in np.array(padded.strides):
@@ -29,9 +29,9 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:
     """Return the slices of the smallest box that holds all occupied voxels of a grid (a, b, c).
 
-    ValueError if no voxel is occupied.
+    Raise ValueError if no voxel is occupied.
     """
-    # Seen along the first axis, which numpy takes ten times as fast as others.
+    # numpy reduces the first axis ten times as fast as others.
     seen = occupancy.any(axis=0)
     planes = occupancy.reshape(len(occupancy), -1)
     along = np.any(planes, axis=1), np.any(seen, axis=1), np.any(seen, axis=0)
@@ -42,21 +42,21 @@ def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:
 
 
 def filled(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a voxel set (n, n, n), n <= 64, and all that no path over faces joins outside."""
+    """Fill a voxel set (n, n, n), n <= 64: add what no path over faces connects to the outside."""
     from slatprep.geometry.fill import outside_of
 
     return ~outside_of(occupancy)
 
 
 FOOT = 1.5
-"""So far below a ground's top, in voxels, what stands in it is taken to reach."""
+"""Depth, in voxels, to which objects are continued below the top of their ground."""
 
 
 def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.bool_]:
-    """Return the filled set's voxels above the ground; `occupancy` itself where there is none.
+    """Return the filled set's voxels above the ground; `occupancy` itself without ground.
 
-    It is filled first, as what is hollow would be open where it stood on the ground. What is
-    just above the ground goes on below its top, as far as `FOOT`.
+    The set is filled first, as a hollow object would be open where it stood on the ground. Voxels
+    just above the ground are continued below its top, down to `FOOT`.
     """
     if ground is None:
         return occupancy
@@ -64,7 +64,7 @@ def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.boo
     depths = (ground.height - (x[:, None, None] + y[:, None] + z)) / VOXEL_SIZE
     higher: NDArray[np.bool_] = filled(occupancy) & (depths < 0.0)
     below = np.argwhere((depths >= 0.0) & (depths < FOOT))
-    # To round a place moves it by sqrt(3) / 2 at most.
+    # Rounding moves a position by sqrt(3) / 2 at most.
     steps = depths[tuple(below.T)] + 0.9
     over = np.rint(below + steps[:, None] * ground.normal).astype(np.intp)
     inside = ((over >= 0) & (over < RESOLUTION)).all(axis=1)
@@ -75,14 +75,14 @@ def above(occupancy: NDArray[np.bool_], ground: Ground | None) -> NDArray[np.boo
 
 def voxels_of(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the indices (N, 3) uint8 of the occupied voxels, in C order."""
-    # By way of flat indices, as numpy finds those of one axis far faster than those of three.
+    # numpy finds the indices of one axis far faster than those of three.
     return voxels_at(np.flatnonzero(occupancy), occupancy.shape)
 
 
 def voxels_at(
     cells: NDArray[np.intp], shape: tuple[int, ...] = (RESOLUTION,) * 3
 ) -> NDArray[np.uint8]:
-    """Return the voxels (N, 3) uint8 at places of the flattened grid; undoes `flat_index`."""
+    """Return the voxels (N, 3) uint8 at indices of the flattened grid; undo `flat_index`."""
     voxels = np.empty((len(cells), 3), dtype=np.uint8)
     rest = cells.astype(np.uint32)  # Narrow numbers are divided four times as fast.
     for axis in (2, 1, 0):
@@ -96,14 +96,14 @@ def voxels_at(
 def outer_boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return the boundary voxels (B, 3) uint8 of a set with its inside filled, in C order.
 
-    A SLAT has voxels inside the object wherever its parts meet, which the
-    boundary of a solid cannot have; both sides are compared by this one.
+    A SLAT has voxels inside the object where its parts meet, and the boundary of a
+    solid has none there. So both sides are compared by their outer boundaries.
     """
     return voxels_of(boundary(filled(occupancy)))
 
 
 def flat_index(voxels: ArrayLike, side: int = RESOLUTION) -> NDArray[np.intp]:
-    """Return the place (N,) of each voxel (N, 3) in the flattened grid (side,)*3, in C order."""
+    """Return the index (N,) of each voxel (N, 3) in the flattened grid (side,)*3, in C order."""
     x, y, z = np.asarray(voxels).T
     flat: NDArray[np.intp] = x.astype(np.intp)
     for one in (y, z):
@@ -115,11 +115,11 @@ def flat_index(voxels: ArrayLike, side: int = RESOLUTION) -> NDArray[np.intp]:
 def shown_in_cells(
     voxels: NDArray[np.uint8], resolution: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Return cells (M, 3) of the frames' 64^3 grid that voxels of any grid occupy, and whose (M,).
+    """Return the cells (M, 3) of the 64^3 grid that voxels of any grid occupy, with rows (M,).
 
-    A cell is occupied if its centre lies in a voxel, or a voxel's centre in it: of a coarser grid a
-    voxel has several cells, of a finer one a cell may have several voxels, the first of which
-    counts. Cells of a 64^3 grid stay as they are; others are in C order.
+    A cell is occupied if its centre lies in a voxel, or if a voxel's centre lies in it. So a voxel
+    of a coarser grid has several cells. A cell may have several voxels of a finer grid, the first
+    of which counts. Voxels of a 64^3 grid stay as they are; other cells are in C order.
     """
     if resolution == RESOLUTION:
         return voxels, np.arange(len(voxels))
