@@ -1,4 +1,4 @@
-"""What an alignment is worth: what ties would change, how sure it is, and a verdict in one word."""
+"""Judge an alignment: its ambiguity by ties, its probabilities, and a verdict in one word."""
 
 from slatprep.judge.ambiguity import measure_ambiguity as measure_ambiguity
 from slatprep.judge.verdict import THRESHOLDS as THRESHOLDS

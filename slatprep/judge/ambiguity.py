@@ -1,4 +1,4 @@
-"""What ties between placements would change in the labels."""
+"""Measure how the labels differ between tied placements."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from slatprep.records import Alignment, Ambiguity, Annotation, MaterialField, St
 from slatprep.sample import sample
 
 NOTABLE = 0.1
-"""Share of a property's extent in the field from which on it counts as another one."""
+"""Smallest change of a property that counts, as a share of its extent in the field."""
 
 
 MOST_VOXELS = 32_768
-"""Voxels up to which each is looked at under ties: as many as TRELLIS trains on."""
+"""Largest number of voxels that are all compared under ties: as many as TRELLIS trains on."""
 
 FEWER = 4
-"""Of more voxels at most a fourth of that number is looked at: enough for a share to 1 percent."""
+"""Larger SLATs compare at most `MOST_VOXELS` over this: enough for a share to 1 percent."""
 
 
 def thinning(voxels: int) -> int:
-    """Return how many times `MOST_VOXELS` go into the voxels of a SLAT, rounded up."""
+    """Return the number of a SLAT's voxels over `MOST_VOXELS`, rounded up."""
     return max(1, -(-voxels // MOST_VOXELS))
 
 
@@ -35,21 +35,22 @@ def measure_ambiguity(
 ) -> Ambiguity:
     """Measure how the labels change between placements that fit about equally well.
 
-    `annotation` is what was looked up under the alignment's transform; its ``placements`` tie with
-    it. The share is of SLAT voxels whose class differs in any of them; without classes, a property
-    by more than `NOTABLE`. The change of a property is the largest mean absolute one, of log10
-    where it is normalised so, over the voxels valid in both. Of more than `MOST_VOXELS` voxels at
-    most a fourth of that is looked at, evenly chosen.
+    `annotation` is the lookup under the alignment's transform, with which its ``placements`` tie.
+    The share counts SLAT voxels whose class differs in any of them. Without classes it counts
+    voxels with a property that changes by more than `NOTABLE`. The change of a property is the
+    largest mean absolute change, over the voxels valid in both; of log10 if it is normalised so.
+    If there are more than `MOST_VOXELS` voxels, an even choice of at most a fourth of that number
+    is compared.
     """
     times = thinning(len(latents.coords))
-    # An odd step: an even one would, of a grid in order, take some layers alone.
+    # The step is odd, as an even one would take only some layers of a grid in order.
     few = slice(None, None, FEWER * times + 1 if times > 1 else 1)
     centres = latents.centres[few]
     differs = np.zeros(len(centres), dtype=bool)
     change = np.zeros(len(field.table))
     if alignment.placements:
         if alignment.deformation is not None:
-            # The others have no deformation, so the best is compared without its own.
+            # The other placements have no deformation, so the best one is compared without it.
             places = places_of(latents.centres, alignment.transform)
             annotation = sample(field, places, parameters, labels_alone=True)
         material, valid = annotation.material[few], annotation.valid[few]
@@ -60,7 +61,7 @@ def measure_ambiguity(
             differs |= other.material != material
             both = valid & other.valid
             if both.any():
-                # Most voxels are looked up in the same place: there is nothing to take log10 of.
+                # Most voxels keep their properties, so log10 is taken of the changed ones only.
                 columns = zip(properties.T, other.properties.T, strict=True)
                 rows = np.flatnonzero(both & np.any([one != two for one, two in columns], axis=0))
                 mapped = to_mapped(properties[rows], field.table)

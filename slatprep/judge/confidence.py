@@ -1,4 +1,4 @@
-"""Calibrated probabilities: that a placement is right, and that a voxel's class is."""
+"""The calibrated probability that a voxel's class is right, and the causes of an asset's doubt."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from slatprep.judge.model import FLOOR
 
 _OF_SHAPE = {"moved", "moved_most", "bending", "stretch", "scale", "within_2", "within_3",
              "score_similarity", "ground", "directions_worst", "blocks_far"}  # fmt: skip
-"""Which figures speak for another object by its shape; the others do by a rough fit."""
+"""Figures that show another object by its shape; the others show it by a rough fit."""
 
 
 def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
-    """Return what speaks against the same object, compared with a usual right placement.
+    """Return how much ``shape`` and ``roughness`` speak against the same object, largest first.
 
-    For ``shape`` and ``roughness`` the sum of what their figures take from the
-    logarithm of the odds; largest first.
+    Each is the sum by which its figures lower the logarithm of the odds, compared with
+    a usual right placement.
     """
     taken = {"shape": 0.0, "roughness": 0.0}
     for name, added in zip(FIGURES, SAME_OBJECT.contributions(evidence).tolist(), strict=True):
@@ -28,17 +28,17 @@ def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
 
 
 def voxel_figures(around: Surroundings, confidence: float) -> NDArray[np.float32]:
-    """Return the `VOXEL_FIGURES` (N, F) of voxels by what lies around them.
+    """Return the `VOXEL_FIGURES` (N, F) of voxels from their surroundings.
 
-    Near a border of classes it matters how far off a place may be: the shares
-    of other classes count also times the asset's doubt and its roughness.
+    Near a border of classes, the error of a position matters. So the shares of other
+    classes also count times the asset's doubt, and times its roughness.
     """
     unsure = np.float32(-logit(np.clip(confidence, FLOOR, 1.0 - FLOOR)))
     rough = np.float32(around.depth.std())
     count = len(around.distance)
     distance = np.minimum(around.distance, np.float32(5.0))
     whole = (unsure, rough, distance.mean(), around.moved.mean())
-    # A column after the other in memory, as the model looks at them.
+    # Columns are contiguous in memory, as the model reads them.
     return np.concatenate(
         [
             around.others.T,
@@ -53,15 +53,15 @@ def voxel_figures(around: Surroundings, confidence: float) -> NDArray[np.float32
 def class_confidence(
     around: Surroundings, confidence: float, valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Return how likely the class of each voxel (N,) is right, 0 where not valid.
+    """Return the probability (N,) that the class of each voxel is right, 0 if it is not valid.
 
-    `confidence` is the asset's: that of its object times that of its placement. Placements that fit
-    equally well are taken as equally likely: the model's probability counts for those with the same
-    class.
+    `confidence` is the asset's: the probability of its object times that of its placement. Tied
+    placements are equally likely, so the model's probability is multiplied by the share of them
+    that have the same class.
     """
     likely = np.zeros(len(valid), dtype=np.float32)
     if valid.any():
-        # What has no counterpart says nothing of the others, though it is far from everything.
+        # Voxels without a counterpart are far from everything and would distort the means.
         seen = around.where(valid)
         likely[valid] = VOXEL.probability(voxel_figures(seen, confidence)) * (1.0 - seen.tied)
     return likely

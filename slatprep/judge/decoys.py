@@ -1,13 +1,16 @@
-"""How many verdicts are wrong, from decoys: grids aligned with SLATs of other objects.
+"""Estimate how many verdicts are wrong by decoys: grids aligned with SLATs of other objects.
 
-Of a decoy it is known that it is wrong, so decoys show what wrong pairs of this very dataset look
-like. Mass spectrometry counts its errors so: target-decoy competition (Elias and Gygi, Nature
-Methods 2007), a score learned on the decoys and cross-validated (Percolator: Kaell et al.,
-Nature Methods 2007), a probability of an error for each match (PeptideProphet: Keller et al.,
-Analytical Chemistry 2002), and the share of wrong matches from those that score like any decoy
-(Storey, Journal of the Royal Statistical Society B, 2002).
+A decoy is wrong by construction, so decoys show what wrong pairs of this dataset look like.
+Mass spectrometry counts its errors in this way:
 
-Decoys tell nothing of a wrong placement of the right object.
+- target-decoy competition (Elias and Gygi, Nature Methods 2007);
+- a score learned on the decoys and cross-validated (Percolator: Kaell et al., Nature Methods 2007);
+- a probability of an error for each match (PeptideProphet: Keller et al., Analytical Chemistry
+  2002);
+- the share of wrong matches, estimated from matches that score like decoys (Storey, Journal of
+  the Royal Statistical Society B, 2002).
+
+Decoys say nothing about a wrong placement of the right object.
 """
 
 from __future__ import annotations
@@ -27,51 +30,51 @@ from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 Range = tuple[float, float]
 
 FOLDS, ROUNDS = 3, 3
-"""Parts of the objects, each scored by a fit to the others; rounds of choosing what is right."""
+"""Number of parts of the objects, each scored by a fit to the others, and of rounds of fits."""
 
 SURE = 0.01
-"""Targets up to this rate of errors are taken as right in a fit."""
+"""Largest rate of errors up to which a fit treats targets as right."""
 
 RIDGE = 3.0
-"""How strongly a fit is held to the shipped model, against one target of each side."""
+"""Strength with which a fit is held to the shipped model, relative to one sample of each side."""
 
 LIKE_DECOYS = 0.3
-"""Targets that this share of the decoys surpasses are counted as wrong ones."""
+"""Share of the decoys whose scores surpass a target that counts as wrong."""
 
 DRAWS, LIKELY = 4_000, (0.025, 0.975)
-"""Draws and ends of an interval."""
+"""Number of draws for an interval, and the quantiles at its ends."""
 
 LEARNED = {"directions_near": -1, "directions_middle": -1, "directions_worst": -1,
            "blocks_near": 1, "blocks_middle": 1, "blocks_far": 1, "slat_within_1": 1,
            "pixieverse_within_1": 1, "moved": -1, "bending": -1, "stretch": -1,
            "valid_share": 1}  # fmt: skip
-"""Figures whose weight a dataset may change, and whether what is right has more or less of it."""
+"""Figures whose weight a dataset may change; 1 if right pairs have larger values, -1 if smaller."""
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorRates:
-    """What decoys say of the verdicts of a dataset.
+    """Error rates of a dataset's verdicts, estimated by decoys.
 
     Attributes
     ----------
     refitted : bool
-        Whether the score was learned on them; else the shipped model's stands.
+        Whether the score was learned on the decoys; else it is the shipped model's.
     wrong_share : float
         Share of the targets that show another object.
     wrong_share_range : tuple of float
-        Where it lies with a probability of 0.95.
+        Interval of that share, with a probability of 0.95.
     good : int
-        Targets that are called good.
+        Number of targets that are called good.
     good_wrong : float
-        How many of those show another object.
+        Estimated number of good targets that show another object.
     good_wrong_range : tuple of float
-        Where that number lies with a probability of 0.95.
+        Interval of that number, with a probability of 0.95.
     scores, decoy_scores : ndarray of float64, shape (T,) and (D,)
         Logarithms of the odds that the object is the same.
     errors : ndarray of float64, shape (T,)
         Posterior probability that a target shows another object.
     rates : ndarray of float64, shape (T,)
-        Least share of wrong ones among all targets up to a score that includes this one.
+        Smallest share of wrong targets in any set of all targets above a score, this one included.
     """
 
     refitted: bool
@@ -86,9 +89,9 @@ class ErrorRates:
     rates: Array
 
     def kept(self, rate: float) -> tuple[int, float]:
-        """Return how many targets may be kept at a share of wrong ones of at most `rate`.
+        """Return the number of targets to keep for a share of wrong ones of at most `rate`.
 
-        And their least score; NaN where none may be.
+        Return their lowest score as well; NaN if there are none.
         """
         kept = self.rates <= rate
         return int(kept.sum()), float(self.scores[kept].min()) if kept.any() else np.nan
@@ -104,11 +107,11 @@ def error_rates(
     good_decoys: NDArray[np.bool_],
     seed: int = 0,
 ) -> ErrorRates:
-    """Count the errors of a dataset by its decoys, of the `FIGURES` of each, (T, F) and (D, F).
+    """Estimate a dataset's errors from the `FIGURES` of its targets (T, F) and decoys (D, F).
 
-    Folds (T,) and (D,) say which of `FOLDS` parts each belongs to: all of one object, and its
-    decoys, to one. `good` (T,) and `good_decoys` (D,) are called good. Intervals are taken from
-    draws of `seed`.
+    Folds (T,) and (D,) are numbers of `FOLDS` parts; all targets and decoys of an object are in one
+    part. `good` (T,) and `good_decoys` (D,) tell which are called good. Intervals come from random
+    draws with `seed`.
     """
     refitted = len(targets) >= LEAST_TARGETS and len(decoys) >= LEAST_DECOYS
     scores, decoy_scores = map(_shipped_scores, (targets, decoys))
@@ -143,12 +146,12 @@ def _ends(draws: Array) -> Range:
 def _wrong_share(
     scores: Array, decoy_scores: Array, rng: np.random.Generator
 ) -> tuple[float, Array]:
-    """Estimate the share of targets that score as decoys do; return also draws of it."""
+    """Return the estimated share of targets that score like decoys, and draws of that share."""
     limit = np.quantile(decoy_scores, 1.0 - LIKE_DECOYS, method="higher")
     low, low_decoys = (float(np.mean(values <= limit)) for values in (scores, decoy_scores))
 
     def drawn(share: float, count: int) -> Array:
-        # Half of one, and half of none, as nobody has seen all of them.
+        # Half a sample on each side is added (Jeffreys' prior), as samples are finite.
         return rng.beta(share * count + 0.5, (1 - share) * count + 0.5, DRAWS)
 
     shares = drawn(low, len(scores)) / drawn(low_decoys, len(decoy_scores))
@@ -161,8 +164,8 @@ def _surpassed(scores: Array, by: Array) -> NDArray[np.intp]:
 
 
 def _rates(scores: Array, decoy_scores: Array, share: float) -> Array:
-    """Return the least rate of wrong ones at which each target is kept."""
-    # One decoy more than were seen, so that no rate is stated that so few cannot show.
+    """Return the smallest rate of wrong targets at which each target is kept."""
+    # One more decoy is counted, as few decoys cannot show a rate near 0.
     wrong = (_surpassed(scores, decoy_scores) + 1.0) / (len(decoy_scores) + 1.0)
     kept = _surpassed(scores, scores)
     order = np.argsort(scores, kind="stable")
@@ -173,7 +176,7 @@ def _rates(scores: Array, decoy_scores: Array, share: float) -> Array:
 
 def _posterior_errors(scores: Array, decoy_scores: Array, share: float) -> Array:
     """Return the probability that each target is wrong; it never rises with the score."""
-    # A decoy that scores as high as the best target stands for those that were not drawn.
+    # One more decoy with the highest score stands for the decoys that were not drawn.
     decoys = np.append(decoy_scores, max(scores.max(), decoy_scores.max()))
     values = np.concatenate([scores, decoys])
     each = share * len(scores) / len(decoys)
@@ -190,7 +193,7 @@ def _posterior_errors(scores: Array, decoy_scores: Array, share: float) -> Array
 def _refitted(
     targets: Array, decoys: Array, target_folds: NDArray[np.intp], decoy_folds: NDArray[np.intp]
 ) -> tuple[Array, Array]:
-    """Score targets and decoys by fits to the other folds, which start from the shipped model."""
+    """Score the targets and decoys of each fold by a fit, from the shipped model, to the others."""
     both = np.concatenate([targets, decoys])
     folds = np.concatenate([target_folds, decoy_folds])
     decoy = np.arange(len(both)) >= len(targets)
@@ -214,13 +217,13 @@ def _refitted(
 
 def _shipped_scores(evidence: Array) -> Array:
     """Return the shipped model's logarithms of the odds, between -15 and 15."""
-    # Not of its probabilities: most decoys have the least that it states.
+    # Probabilities are not used, as most decoys have the smallest one (`FLOOR`).
     odds: Array = SAME_OBJECT.contributions(evidence).sum(axis=1) + SAME_OBJECT.intercept
     return odds.clip(-15.0, 15.0)
 
 
 def _features(evidence: Array, decoy: NDArray[np.bool_]) -> Array:
-    """Return the shipped model's score and `LEARNED`, better where larger, in decoys' spreads."""
+    """Return the shipped score and the figures `LEARNED`, in decoys' spreads; larger is better."""
     columns = [FIGURES.index(name) for name in LEARNED]
     chosen = np.nan_to_num(evidence[:, columns] * np.array(list(LEARNED.values())))
     centre, spread = chosen[decoy].mean(axis=0), chosen[decoy].std(axis=0)
@@ -229,9 +232,9 @@ def _features(evidence: Array, decoy: NDArray[np.bool_]) -> Array:
 
 
 def _fit(right: Array, wrong: Array) -> Array:
-    """Fit weights and a constant to right and wrong ones, each side with the weight of one half.
+    """Fit weights and a constant to right and wrong samples, each side with a weight of one half.
 
-    The shipped score's weight is held to 1 and the others to 0; none is negative.
+    A ridge holds the shipped score's weight near 1 and the others near 0; none is negative.
     """
     x = np.concatenate([right, wrong])
     y = np.repeat([1.0, -1.0], [len(right), len(wrong)])

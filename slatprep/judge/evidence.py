@@ -1,4 +1,4 @@
-"""The figures of an alignment, and of each of its voxels, from which confidence follows."""
+"""Measure the figures of an alignment, and of its voxels, that determine the confidence."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ FIGURES = (
     "slat_within_half", "slat_within_1", "slat_within_15",
     "pixieverse_within_half", "pixieverse_within_1", "pixieverse_within_15",
 )  # fmt: skip
-"""The figures of an alignment, in the order of `evidence_of`."""
+"""Names of an alignment's figures, in the order of `evidence_of`."""
 
 RADII = (1, 2, 4, 7)
-"""Distances [voxel] at which the classes around a voxel's place are looked at."""
+"""Distances [voxel] at which the classes around a voxel's position are compared."""
 
 VOXEL_FIGURES = (
     *(f"others_{radius}" for radius in RADII),
@@ -47,33 +47,33 @@ VOXEL_FIGURES = (
     "asset_distance",
     "asset_moved",
 )
-"""The figures of a voxel, in the order of `confidence.voxel_figures`."""
+"""Names of a voxel's figures, in the order of `confidence.voxel_figures`."""
 
 MARGIN_CAP = 0.3
-"""Margins above this say no more."""
+"""Largest margin; larger margins are reduced to it."""
 
 HARMLESS = 0.05
-"""Ties that change the class of no more than this share of the voxels count as one."""
+"""Largest share of voxels whose class changes between ties that count as one placement."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What lies around the places of N voxels.
+    """The surroundings of N voxels' positions in the PixieVerse frame.
 
     Attributes
     ----------
     others, solid : ndarray of float32, shape (N, 4)
-        Of the cells at `RADII`: the share that is annotated with another class
-        (of the annotated ones; without classes, with other properties), and the
-        share that is annotated at all.
+        Shares of the cells at `RADII`: annotated cells with another class (without
+        classes, with other properties) among annotated ones, and annotated cells
+        among all.
     distance : ndarray of float32, shape (N,)
-        To the annotation used, in voxels.
+        Distance to the annotation used, in voxels.
     moved : ndarray of float32, shape (N,)
-        How far the deformation moves the voxel's place, in voxels.
+        Distance by which the deformation moves the voxel's position, in voxels.
     tied : ndarray of float32, shape (N,)
-        Share of the placements that fit about as well, the one chosen among
-        them, that have another class at the voxel; 0 where a consensus chose, and
-        where the mean is no more than `HARMLESS`.
+        Share of the tied placements, with the chosen one, that give the voxel another
+        class. It is 0 if a consensus or latents chose, or if the mean is at most
+        `HARMLESS`.
     """
 
     others: NDArray[np.float32]
@@ -88,14 +88,14 @@ class Surroundings:
         return self.solid[:, 1] - np.float32(0.5)
 
     def where(self, chosen: NDArray[np.bool_]) -> Surroundings:
-        """Return what lies around the chosen ones (N,) of the places."""
+        """Return the surroundings of the `chosen` (N,) voxels."""
         return Surroundings(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def surroundings_of(
     field: MaterialField, latents: StructuredLatents, alignment: Alignment, annotation: Annotation
 ) -> Surroundings:
-    """Look at what lies around the places where voxels were looked up."""
+    """Measure the surroundings of the positions at which SLAT voxels were looked up."""
     from slatprep.geometry.surroundings import labelled, shares_around
 
     of_voxels, labels = _labels_of(field, annotation)
@@ -108,7 +108,7 @@ def surroundings_of(
         moved = np.linalg.norm(annotation.place - before, axis=1) / np.float32(VOXEL_SIZE)
     tied = np.zeros(count, dtype=np.float32)
     ties = alignment.open_placements
-    # Of a SLAT with far more voxels than usual some ties stand for all.
+    # If a SLAT has far more voxels than usual, some ties stand for all.
     some = ties[:: thinning(count)]
     for placement in some:
         places = places_of(latents.centres, placement.transform).astype(np.float32)
@@ -117,7 +117,7 @@ def surroundings_of(
         tied *= np.float32(len(ties) / len(some))
     tied /= np.float32(len(ties) + 1)
     if tied.mean() <= HARMLESS:
-        tied[:] = 0.0  # They count as one: at their few voxels the chosen one is right as often.
+        tied[:] = 0.0  # Ties count as one: the chosen class is right as often.
     return Surroundings(others, solid, annotation.distance, moved, tied)
 
 
@@ -126,8 +126,8 @@ def _labels_of(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return a label of each annotated voxel (K,), and of each SLAT voxel (N,).
 
-    Without classes, voxels have the same label if the same multiple of `NOTABLE` times the
-    extent is nearest to each property; of more than 255 combinations, of coarser multiples.
+    Without classes, voxels have the same label if each property rounds to the same multiple of
+    `NOTABLE` times its extent. If there are more than 255 combinations, multiples are coarser.
     """
     if field.classified:
         return field.material, annotation.material
@@ -139,15 +139,15 @@ def _labels_of(
 
 
 def labels_hold(field: MaterialField, annotation: Annotation, off: NDArray[np.float64]) -> bool:
-    """Whether the labels of voxels, see `surroundings_of`, are the same for rounded properties.
+    """Return whether rounding of the properties leaves the labels of `surroundings_of` the same.
 
-    Each mapped property may be off by `off` (P,) at most; classes are never rounded.
+    It changes each mapped property by at most `off` (P,). Classes are never rounded.
     """
     if field.classified:
         return True
     steps, size = _steps(field, annotation)
     _, coarsest = _combinations(steps)
-    # A value and the extent's end that it is counted from; and both ends, by which it is divided.
+    # Four errors add up: of the value, of the end that it is measured from, and of the two ends.
     slack = 4.0 * off / size
     coarse = 1
     while coarse <= coarsest:
@@ -161,7 +161,7 @@ def labels_hold(field: MaterialField, annotation: Annotation, off: NDArray[np.fl
 def _steps(
     field: MaterialField, annotation: Annotation
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mapped properties of annotated and of valid voxels in steps; a step's size (P,)."""
+    """Return mapped properties of annotated and valid voxels in steps, and a step's size (P,)."""
     ends = property_extent(field)
     size = NOTABLE * np.where(ends[:, 1] > ends[:, 0], ends[:, 1] - ends[:, 0], 1.0)
     values = np.concatenate([field.properties, annotation.properties[annotation.valid]])
@@ -169,7 +169,7 @@ def _steps(
 
 
 def _combinations(steps: NDArray[np.float64]) -> tuple[NDArray[np.intp], int]:
-    """Number the combinations of rounded steps; return also the multiple they are rounded to."""
+    """Return the number of each combination of rounded steps, and the multiple for rounding."""
     coarse = 1
     while True:
         found, number = np.unique(np.rint(steps / coarse), axis=0, return_inverse=True)
@@ -186,13 +186,12 @@ def evidence_of(
     around: Surroundings,
     ambiguity: float,
 ) -> NDArray[np.float64]:
-    """Return the `FIGURES` of an alignment, whatever engine found it.
+    """Return the `FIGURES` of an alignment of any engine.
 
-    Placements that tie and leave nearly all classes alone count as one: of a ball it does not
-    matter which it is, and neither they nor the margin say anything then but that it is so
-    (``alike``). The same where the consensus of a dataset chose among them. `ambiguity` is the
-    share of the voxels whose class depends on the choice among ties. The margin is NaN where it
-    says nothing, and so are figures of the agreement that were not measured.
+    `ambiguity` is the share of the voxels whose class depends on the choice among ties. Ties that
+    change nearly no class, as of a ball, count as one placement. Then ``ties`` is 0, ``margin`` and
+    ``clear_by`` are NaN, and ``alike`` is 1. The same holds if a consensus or latents chose among
+    ties. Figures of the agreement that were not measured are NaN.
     """
     fit = alignment.figures
     if fit is None:

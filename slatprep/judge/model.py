@@ -1,4 +1,4 @@
-"""Logistic models as data, so that each figure's part in a probability is known."""
+"""Logistic models as data, which show each figure's part in a probability."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 FLOOR = 1e-3
-"""No probability is nearer to 0 or to 1: the calibration has not seen enough for that."""
+"""Smallest distance of a probability from 0 and 1; the calibration has no data for a smaller
+one."""
 
 
 @dataclass(frozen=True)
 class Figure:
     """One figure of a model: clipped to `low`..`high`, less `usual`, times `weight`.
 
-    ``usual`` is the mean over right ones, within the same bounds, so that the
-    product is what the figure adds to the logarithm of the odds, compared with a
-    usual right one. Two of one name, whose bounds meet, are a line with a knee.
+    ``usual`` is the mean over right samples, within the same bounds. So the product is what the
+    figure adds to the logarithm of the odds, compared with a usual right sample. Two figures with
+    one name and adjoining bounds are a piecewise linear function with one bend.
     """
 
     name: str
@@ -36,13 +37,13 @@ class Logistic:
     Attributes
     ----------
     names : tuple of str
-        The figures that values have, in their order.
+        Names of the columns of values, in their order.
     figures : tuple of Figure
-        What counts of them; those of one name stand together.
+        Terms of the model; terms of one name are adjacent.
     intercept : float
-        Logarithm of the odds where all figures are as usual.
+        Logarithm of the odds if all figures are as usual.
     curve : tuple of (float, float)
-        Logarithm of the odds, and share of right ones found there; straight in between.
+        Logarithm of the odds, and share of right samples found there; linear in between.
     """
 
     names: tuple[str, ...] = field(repr=False)

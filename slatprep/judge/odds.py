@@ -1,4 +1,4 @@
-"""The logarithms of odds of a logistic model, for thousands of rows; a compiled inner loop."""
+"""Add up logarithms of odds of a logistic model for thousands of rows; a compiled inner loop."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from slatprep.geometry.kernel import kernel
 
 @kernel()
 def add_odds(values, columns, table, odds):  # type: ignore[no-untyped-def]
-    """Add to `odds` (N,) what figures (N, F) say; one that is NaN adds nothing.
+    """Add a model's terms for figures (N, F) to the log odds `odds` (N,); NaN adds nothing.
 
-    `columns` (M,) says where each of the model's terms finds its figure, and `table` (4, M) its
-    weight, what is usual, and its bounds.
+    `columns` (M,) are the columns of the terms' figures. `table` (4, M) has the weight, the usual
+    value, and the lower and upper bound of each term.
     """
     for term in range(len(columns)):
         weight, usual, low, high = table[:, term]

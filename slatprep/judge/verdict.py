@@ -1,4 +1,4 @@
-"""The verdict, from calibrated probabilities, and the reasons for it."""
+"""Give a verdict, from calibrated probabilities, and the reasons for it."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Thresholds:
     Attributes
     ----------
     good_confidence : float
-        Probability that object and placement are right, from which on they are good.
+        Smallest probability that object and placement are right of a good asset.
     failed_confidence : float
-        Probability that the object is the same, or that the placement is right and no other
-        ties with it, below which either is failed.
+        Probability below which an asset is failed: that of the same object, or that of the
+        right placement if no other placement ties with it.
     good_accuracy : float
         Expected share of right labels; below it the asset is doubtful.
     good_valid_share : float
@@ -44,8 +44,8 @@ class Thresholds:
         Rise of the score once one side is mirrored; above it the asset is doubtful, as the
         annotation is a mirror image of its object.
     good_fitness, failed_fitness : float
-        The lower one of the two fitnesses, as the confidences, where no probability is known:
-        where a check finds another fit than the stored one.
+        Limits of the lower of the two fitnesses, used if no probability is known. This happens
+        if a check finds another fit than the stored one.
     """
 
     good_confidence: float = 0.9
@@ -62,7 +62,8 @@ THRESHOLDS = Thresholds()
 """The thresholds of `verdict_of`."""
 
 LEAST_TARGETS, LEAST_DECOYS = 50, 40
-"""Assets and decoys of a dataset; of fewer chance would decide, and the shipped model stands."""
+"""Smallest number of assets and of decoys for a dataset's own model; otherwise chance would decide,
+and the shipped model stays."""
 
 _WORDS = {
     "shape": "the two sides show different shapes",
@@ -79,26 +80,26 @@ def judge(
     annotation: Annotation,
     parameters: SampleParameters,
 ) -> tuple[Judgement, NDArray[np.float32]]:
-    """Say what the alignment of an asset is worth.
+    """Judge the alignment of an asset.
 
     Parameters
     ----------
     field, latents : MaterialField, StructuredLatents
         The two sides of the asset.
     alignment : Alignment
-        Its alignment, of any engine; ``placements`` are the ones that tie with the best.
+        Its alignment, of any engine; its ``placements`` tie with the best.
     annotation : Annotation
-        What was looked up through it.
+        The lookup under that alignment.
     parameters : SampleParameters
         How annotations are looked up.
 
     Returns
     -------
     judgement : Judgement
-        What ties would change, how sure placement and labels are, the verdict,
-        and what kept it from being good.
+        The ambiguity by ties, the probabilities of placement and labels, the verdict,
+        and the reasons why it is not good.
     likely : ndarray of float32, shape (N,)
-        How likely the class of each SLAT voxel is right, as `voxel_confidence` says.
+        Probability that the class of each SLAT voxel is right; see `voxel_confidence`.
     """
     from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT
     from slatprep.judge.confidence import class_confidence
@@ -110,7 +111,7 @@ def judge(
     same, placed = (float(one.probability(evidence)) for one in (SAME_OBJECT, PLACEMENT))
     by = alignment.settled_by
     if by is not None and ambiguity.material_share > THRESHOLDS.good_ambiguity:
-        # One of those that tie is right as likely as without a tie, and this is that one.
+        # So far `placed` is the probability that any of the ties is right; `by` chose one of them.
         placed *= by.probability
     valid = annotation.valid
     likely = class_confidence(around, same * placed, valid)
@@ -134,16 +135,16 @@ def contradicted(judgement: Judgement) -> Judgement:
 
 
 def _doubted(judgement: Judgement, reason: str) -> Judgement:
-    """Return a judgement that is not good, for one more reason."""
+    """Return the judgement with one more reason, and at best doubtful."""
     verdict = Verdict.DOUBTFUL if judgement.verdict is Verdict.GOOD else judgement.verdict
     return replace(judgement, verdict=verdict, reasons=(*judgement.reasons, reason))
 
 
 def merged(judgement: Judgement, annotation: Annotation) -> Judgement:
-    """Return what several annotations are worth together.
+    """Return the judgement of several annotations together.
 
-    The judgement is of the first of them, by its own labels, the annotation what
-    `slatprep.sample.merge` made of all. Where fewer labels can be expected to be right because the
+    `judgement` is that of the first annotation by its own labels. `annotation` is the result of
+    `slatprep.sample.merge` for all. If fewer labels can be expected to be right because the
     annotations differ, the asset is doubtful.
     """
     valid = annotation.valid
@@ -167,10 +168,10 @@ def voxel_confidence(
     annotation: Annotation,
     confidence: float,
 ) -> NDArray[np.float32]:
-    """Say how likely the class of each SLAT voxel (N,) is right; 0 where not valid.
+    """Return the probability (N,) that the class of each SLAT voxel is right; 0 if not valid.
 
-    All is as `judge` takes it; `confidence` is what that says of the placement. Calibrated for the
-    mix of data that docs/quality.md names.
+    Arguments are those of `judge`, and `confidence` is that of its judgement. The probability is
+    calibrated for the mix of data that docs/quality.md names.
     """
     from slatprep.judge.confidence import class_confidence
     from slatprep.judge.evidence import surroundings_of
@@ -182,16 +183,16 @@ def voxel_confidence(
 def verdict_of(
     alignment: Alignment, judgement: Judgement, valid_share: float
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """Say what an alignment is worth, and why it is not better.
+    """Return the verdict on an alignment, and the reasons why it is not better.
 
-    The fit is the alignment's, all else the `judgement`'s, whose verdict and reasons are not looked
-    at. Where its probabilities are NaN the fitness decides. `valid_share` is the share of SLAT
+    The fit is the alignment's. All else is the `judgement`'s, whose verdict and reasons are
+    ignored. If its probabilities are NaN, the fitness decides. `valid_share` is the share of SLAT
     voxels that got an annotation.
     """
     limits, quality = THRESHOLDS, alignment.quality
     same_object, right_placement = judgement.same_object, judgement.right_placement
     ambiguity, ties = judgement.ambiguity.material_share, len(alignment.open_placements)
-    # Among placements that tie nobody has chosen yet: any of them may be right.
+    # Nothing has chosen among the tied placements yet, so any of them may be right.
     tied = ties > 0 and ambiguity > limits.good_ambiguity
     reasons: list[str] = []
     if math.isnan(same_object * right_placement):
@@ -220,7 +221,7 @@ def verdict_of(
             f"voxels (good needs {limits.good_ambiguity:.0%})"
         )
     mirrored = math.nan if alignment.figures is None else alignment.figures.mirrored
-    # Of another object nobody can tell.
+    # A mirror image of another object cannot be recognised.
     if mirrored > limits.good_mirrored and not same_object < limits.failed_confidence:
         reasons.append(
             "the annotation is a mirror image of its object, left for right: mirrored, it fits "
@@ -234,7 +235,7 @@ def verdict_of(
 
 
 def _doubts(quality: Quality, judgement: Judgement, wrong: bool) -> list[str]:
-    """Say which of the two questions takes the confidence away, the worse one first."""
+    """Return the reasons for a low confidence, by object and placement, the worse one first."""
     from slatprep.judge.confidence import causes_of_doubt
 
     limits, sure = THRESHOLDS, ("perhaps", "probably")
@@ -253,18 +254,18 @@ def _doubts(quality: Quality, judgement: Judgement, wrong: bool) -> list[str]:
         f"{right_placement:.1%} {good}"
     )
     doubts = sorted([(same_object, of_object), (right_placement, of_placement)])
-    # Either that alone would take half of what may be taken is told.
+    # A probability is told if it alone causes half of the allowed loss, in logarithms.
     told = [text for likely, text in doubts if likely < limits.good_confidence**0.5]
     reasons = told or [doubts[0][1]]
     if same_object < limits.failed_confidence:
-        reasons = [of_object]  # On another object no placement is right.
+        reasons = [of_object]  # No placement on another object is right.
     if same_object <= right_placement:
         reasons += _low_fitness(quality, "before any deformation")
     return reasons
 
 
 def _low_fitness(quality: Quality, told: str) -> list[str]:
-    """Say which of the two fitnesses is low, and what is `told` of them."""
+    """Return a reason for each of the two fitnesses that is low; each ends with `told`."""
     return [
         f"{fitness:.1%} of the {side} boundary lies within {quality.radius:g} voxel of the other "
         f"side {told}"

@@ -1,13 +1,11 @@
-"""What latents say of labels: under which of several placements they are likelier.
+"""Measure by latents which of several placements has the likelier labels.
 
-Where geometry cannot tell placements apart, latents may, if they know of
-classes at all. Of every class a Gaussian of the latents is estimated from
-assets whose labels are sure, with one covariance for all classes (linear
-discriminant analysis); an asset is never judged by a model that has seen its
-object. What the sum of log likelihoods over a block of space is worth,
-neighbouring voxels being much alike, is calibrated on the sure assets: their
-labels against those that they would have half a turn away (Platt,
-"Probabilistic Outputs for Support Vector Machines", 1999, without a bias).
+If geometry cannot tell placements apart, latents may, provided that they know classes. A Gaussian
+of the latents of each class is estimated from assets whose labels are sure, with one covariance for
+all classes (linear discriminant analysis). An asset is never judged by a model that has seen its
+object. Neighbouring voxels are much alike, so the sum of log likelihoods over a block of space has
+to be calibrated. The sure assets serve for that: their labels are compared with the labels after
+half a turn (Platt, "Probabilistic Outputs for Support Vector Machines", 1999, without a bias).
 """
 
 from __future__ import annotations
@@ -37,37 +35,37 @@ from slatprep.records import (
 from slatprep.sample import lattice_of, sample
 
 PARTS = 5
-"""Parts of a dataset, by object, each judged by a model of the others."""
+"""Number of parts of a dataset, by object; a model of the others judges each part."""
 
 DECISIVE = 0.95
-"""From this probability on a placement is taken to be the right one."""
+"""Smallest probability at which a placement is treated as right."""
 
 CHANCE = 1e-3
-"""Latents are used if so many sure assets agreeing would be rarer than this by chance."""
+"""Probability of the observed agreement by chance below which latents are used."""
 
 MOST_FACTOR = 1e4
-"""Log odds that a block of usual strength can be worth; Platt's target keeps far below."""
+"""Upper limit of the log odds of a block of usual strength; Platt's target keeps far below it."""
 
 RARE = 0.005
-"""Labels are contradicted that are less likely than those of all but this share of sure assets,
-and less likely than if their classes were drawn at random."""
+"""Quantile of the sure assets' gains below which labels are contradicted, if they are also less
+likely than classes drawn at random."""
 
 OTHER_LABELS = 0.01
-"""Tied placements that change the class of more than this share of the voxels differ in labels."""
+"""Largest share of voxels whose class differs between placements with the same labels."""
 
 BLOCK = 8
-"""Edge, in voxels, of the blocks that count as one observation each."""
+"""Edge, in voxels, of a block that counts as one observation."""
 
 REACH = 6.0
-"""Voxels that half a turn may carry a place off the nearest annotated voxel."""
+"""Largest distance, in voxels, from a position after half a turn to an annotated voxel."""
 
-_SHRINK = 1.0  # assets' worth of the mean of all latents in the mean of each class
-_RIDGE = 1e-3  # of a channel's usual variance
+_SHRINK = 1.0  # weight, in assets, of the mean of all latents in the mean of each class
+_RIDGE = 1e-3  # share of a channel's variance
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over latents, each asset's with weight one: of each class, and of all products."""
+    """Sums over latents, each asset with weight one: by class (K,), (K, C); of products (C, C)."""
 
     weight: Array
     total: Array
@@ -82,16 +80,16 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class LatentModel:
-    """Gaussians of latents by class, with one precision, and the classes' shares."""
+    """Gaussians of latents by class, with one precision matrix, and the shares of the classes."""
 
     means: Array
     precision: Array
     shares: Array
 
     def log_likelihood(self, feats: NDArray[np.float32]) -> Array:
-        """Return the log likelihood (N, K) of latents (N, C) by class, but for a term of each row.
+        """Return the log likelihood (N, K) of latents (N, C) by class, without a term of each row.
 
-        That term, -z P z / 2, is the same for all classes, and only differences count.
+        The term -z P z / 2 is the same for all classes, and only differences count.
         """
         weights = self.precision @ self.means.T
         likely: Array = feats.astype(np.float64) @ weights - 0.5 * (self.means.T * weights).sum(0)
@@ -100,7 +98,7 @@ class LatentModel:
     def gain(self, feats: NDArray[np.float32], material: NDArray[np.uint8]) -> float:
         """Return the mean log likelihood of labels (N,) less that of classes drawn at random.
 
-        Voxels without a label do not count; 0 where none has one.
+        Voxels without a label do not count. Return 0 if no voxel has a label.
         """
         known = material != UNANNOTATED
         if not known.any():
@@ -112,23 +110,23 @@ class LatentModel:
 
 @dataclass(frozen=True, eq=False)
 class LatentEvidence:
-    """What an asset's latents say, before it is known how much that is worth.
+    """The evidence of an asset's latents, before it is weighted by their reliability.
 
     Attributes
     ----------
     support : ndarray of float64, shape (K,)
-        Sum of the log likelihoods of the voxels that have a class under all
-        placements, the one chosen first; K is 1 where nothing is tied.
+        Log likelihood under each placement, the chosen one first, over the voxels that
+        have a class under all placements; K is 1 without ties.
     differing : ndarray of int64, shape (K, K)
-        Of those, how many have other classes under the two placements.
+        Number of these voxels whose class differs between two placements.
     voxels : int
-        How many those are.
+        Number of these voxels.
     gain : float
-        What `LatentModel.gain` says of its labels.
+        `LatentModel.gain` of the asset's labels.
     against : tuple of ndarray of float64, shape (B,)
-        Log likelihood of its labels less that of labels half a turn away, about
-        each of three axes, in B blocks; a turn that changes too few classes is
-        left out.
+        Log likelihood of the labels less that of the labels after half a turn about
+        each of three axes, in B blocks. A turn that changes too few classes is left
+        out.
     """
 
     support: Array
@@ -140,17 +138,17 @@ class LatentEvidence:
 
 @dataclass(frozen=True)
 class Reliability:
-    """How far latents can be relied on: how those of sure assets fit right and wrong labels.
+    """The reliability of latents: how those of sure assets fit right and wrong labels.
 
     Attributes
     ----------
     witnesses, agreeing : int
-        Sure assets that could be compared, and those whose latents fit their own labels
-        best.
+        Number of sure assets that could be compared, and of those whose latents fit their own
+        labels best.
     factor : float
-        By which a log likelihood is multiplied; 0 where latents are not used.
+        Factor of a log likelihood; 0 if latents are not used.
     least_gain : float
-        Gain below which latents contradict labels; minus infinity where they are not used.
+        Gain below which latents contradict labels; minus infinity if they are not used.
     """
 
     witnesses: int
@@ -178,10 +176,10 @@ def moments_of(
 
 
 def fit_models(moments: Iterable[tuple[str, Moments]]) -> list[LatentModel] | None:
-    """Estimate for each part the latents of the classes in all others.
+    """Fit, for each part, a model of the latents of the classes in all other parts.
 
     `moments` has the object id and the moments of each sure asset, in an order that does not depend
-    on the number of jobs. None where the assets of all other parts have less than two classes.
+    on the number of jobs. Return None if the other parts of any part have fewer than two classes.
     """
     sums: dict[int, Moments] = {}
     for object_id, some in moments:
@@ -218,14 +216,14 @@ def weigh(
     model: LatentModel,
     parameters: SampleParameters,
 ) -> LatentEvidence:
-    """Compare an asset's latents with its labels, and with those it could have instead.
+    """Compare an asset's latents with its labels, and with the labels of tied placements.
 
-    Its labels `material` (N,) are 255 where there is none; the model is of other objects.
+    `material` (N,) are its labels, 255 for none. The model must come from other objects.
     """
     likely = model.log_likelihood(latents.feats)
     labels = material[None]
     if alignment.placements:
-        # The others have no deformation, so the best is compared without its own.
+        # The other placements have no deformation, so the best one is compared without it.
         tied = (alignment.transform, *(p.transform for p in alignment.placements))
         places = (places_of(latents.centres, transform) for transform in tied)
         labels = np.stack([sample(field, place, parameters).material for place in places])
@@ -273,14 +271,14 @@ def _against(
 
 
 def reliability_of(evidence: Sequence[LatentEvidence]) -> Reliability:
-    """Find out from assets whose labels are sure what their latents are worth.
+    """Measure the reliability of latents on assets whose labels are sure.
 
-    The factor is 0 where these do not prefer their own labels more often than chance would have it.
+    The factor is 0 if latents do not prefer their own labels more often than by chance.
     """
     compared = [one.against for one in evidence if one.against]
     agreeing = sum(min(float(blocks.sum()) for blocks in against) > 0 for against in compared)
     factor = 0.0
-    # The probability of so many heads or more.
+    # The probability of at least that many heads in tosses of a coin.
     if compared and bdtrc(agreeing - 1, len(compared), 0.5) < CHANCE:
         factor = _factor([np.concatenate(against) for against in compared])
     gains = np.array([one.gain for one in evidence])
@@ -289,36 +287,36 @@ def reliability_of(evidence: Sequence[LatentEvidence]) -> Reliability:
 
 
 def _factor(compared: Sequence[Array]) -> float:
-    """Return the factor that makes log likelihoods of blocks (B,) log odds, by asset alike."""
-    # Late: it takes half a second of CPU, which a build that has nothing to do would pay, too.
+    """Return the factor that turns blocks' log likelihoods (B,) into log odds, each asset alike."""
+    # Imported here: it takes half a second of CPU, which a build with nothing to do is spared.
     from scipy.optimize import brentq
 
     blocks = np.concatenate(compared)
     weight = np.concatenate([np.full(len(some), 1.0 / len(some)) for some in compared])
     unit = float(np.sqrt(np.average(blocks**2, weights=weight)))
-    # Platt's target: all agreeing is no proof that the next one will.
+    # Platt's target is below 1: agreement of all assets is no proof for the next one.
     target = (len(compared) + 1.0) / (len(compared) + 2.0)
 
     def slope(factor: float) -> float:
         return float(np.sum(weight * blocks / unit * (target - expit(factor * blocks / unit))))
 
-    # Where nothing is compared for the slope falls from the start.
+    # If blocks do not favour their own labels on the whole, the slope is negative from the start.
     return brentq(slope, 0.0, MOST_FACTOR) / unit if slope(0.0) > 0.0 > slope(MOST_FACTOR) else 0.0
 
 
 def choice_of(found: LatentEvidence, reliability: Reliability) -> tuple[int, LatentChoice] | None:
     """Choose among an asset's tied placements, if its latents are decisive.
 
-    Returns the number of the placement; 0 is the one that the asset has, which stands where its
-    labels are those of the likeliest one. None where nothing tied changes labels, or the latents do
-    not say enough.
+    Return the number of the placement and the choice. Number 0 is the asset's own placement, which
+    stays if it has the labels of the likeliest one. Return None if no tied placement changes
+    labels, or if the latents are not decisive.
     """
     different = found.differing > OTHER_LABELS * max(found.voxels, 1)
     best = int(np.argmax(found.support))
     if reliability.factor == 0.0 or not different[best].any():
         return None
     probability = float(softmax(reliability.factor * found.support)[~different[best]].sum())
-    # A choice cannot be surer than the latents of sure assets are reliable.
+    # A choice cannot be more certain than the latents of sure assets are reliable.
     probability = min(probability, (reliability.agreeing + 1.0) / (reliability.witnesses + 2.0))
     if probability < DECISIVE:
         return None
