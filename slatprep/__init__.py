@@ -1,13 +1,13 @@
-"""slatprep: physics supervision for structured latents that one can trust.
+"""slatprep: physics supervision for structured latents that you can trust.
 
-The nouns and verbs that a notebook needs, loaded when they are first used;
-``__init__.pyi`` lists them (Scientific Python's SPEC 1):
+The names that a notebook needs, loaded on first use. ``__init__.pyi`` lists them
+(Scientific Python's SPEC 1):
 
 - a store: `open_store`, `Store`, `StoredAsset`, `build_store`, `export_store`;
 - what is in it: `store_statistics`, `compare_stores`;
 - its sources: `load_parameters`, `discover`, `read_field`, `read_latents`;
 - two voxel sets: `align_voxels`, `annotate_voxels`, `apply_transform`, and
-  `map_of`, which makes of an alignment the map of points, a `PlaceMap`;
+  `map_of`, which returns an alignment's map of points, a `PlaceMap`;
 - properties: `normalize_properties`, `denormalize_properties`, `PIXIE_RANGES`;
 - the records that travel between them: `MaterialField`, `StructuredLatents`,
   `Alignment`, `Annotation`, `Normalization`, ...

@@ -1,4 +1,4 @@
-"""The stages on plain arrays, with defaults: what a notebook calls."""
+"""The stages on plain arrays, with defaults, for notebooks."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def align_voxels(
     -------
     Alignment
         ``transform`` (4, 4) takes points of the PixieVerse frame to points of
-        the SLAT frame, both the unit cube [-0.5, 0.5]^3; with ``quality``, the
-        score of every candidate, and the ``deformation`` where the shapes differ.
-        `slatprep.map_of` makes of it the map of points, both ways.
+        the SLAT frame, both the unit cube [-0.5, 0.5]^3. Further fields are ``quality``,
+        the score of every candidate, and the ``deformation`` if the shapes differ.
+        `slatprep.map_of` returns its map of points, in both directions.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def align_voxels(
 
     Notes
     -----
-    The problem is the one of SLAT-Phys, "Physics-to-SLAT Annotation
+    The problem is that of SLAT-Phys, "Physics-to-SLAT Annotation
     Alignment"; the default engine is described in docs/method.md.
 
     Examples
@@ -108,8 +108,8 @@ def annotate_voxels(
     coords : array_like, shape (N, 3)
         SLAT voxels in 0..resolution - 1.
     transform : Alignment, or array_like, shape (4, 4)
-        What `align_voxels` found, its deformation included; or a similarity,
-        PixieVerse frame to SLAT frame.
+        An alignment from `align_voxels`, used with its deformation; or a similarity
+        from the PixieVerse frame to the SLAT frame.
     parameters : SampleParameters, optional
         How far an annotation may be; the defaults of a build otherwise.
     resolution : int

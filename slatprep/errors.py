@@ -10,10 +10,10 @@ from contextlib import contextmanager
 
 
 def in_unicode(text: str) -> str:
-    r"""Return a text in which whatever UTF-8 cannot hold is written out.
+    r"""Return a text with escapes for all characters that UTF-8 cannot encode.
 
-    Names of files are bytes; those that are no UTF-8 come as lone surrogates, which no record,
-    store or terminal takes.
+    File names are bytes. Python represents bytes that are not UTF-8 as lone surrogates, which no
+    record, store or terminal accepts.
 
     >>> print(in_unicode("a\udcff.npz"))
     a\udcff.npz
@@ -24,8 +24,8 @@ def in_unicode(text: str) -> str:
 def printable(text: str) -> str:
     r"""Return text with control characters written as JSON escapes.
 
-    Names and categories are not trusted. Line breaks, tabs, spaces of any width, and what joins
-    letters or parts them, are kept.
+    Names and categories are not trusted. Line breaks, tabs, spaces of any width, joiners and
+    non-joiners are kept.
 
     >>> print(printable("cup" + chr(27) + "[2J"))
     cup\u001b[2J
@@ -45,7 +45,7 @@ def _escaped(character: str) -> str:
 
 
 def apart_from(name: str, others: Collection[str]) -> str:
-    """Return the name of a row of a table, in quotes where another row has it.
+    """Return the name of a table's row, in quotes if another row has the same name.
 
     >>> apart_from("cup", ("all",)), apart_from("all", ("all",))
     ('cup', '"all"')
@@ -73,7 +73,7 @@ def tally(words: Iterable[object]) -> str:
 
 
 def require_one_of(name: str, value: object, allowed: Iterable[str]) -> None:
-    """Raise ConfigError if a parameter's value is none of the allowed words."""
+    """Raise ConfigError if a parameter's value is not one of the allowed words."""
     if value not in (words := tuple(allowed)):
         raise ConfigError(f"{name} is {value!r}; expected one of {', '.join(words)}")
 
@@ -105,8 +105,8 @@ class InputError(SlatprepError):
         self.expected = expected
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
-        # An exception with its own signature must say how to rebuild itself
-        # to travel from a worker process back to the parent.
+        # Pickle needs this to send an exception with its own signature from a worker
+        # process to the parent.
         return (type(self), (self.path, self.fault, self.expected))
 
 
@@ -123,12 +123,12 @@ class StoreError(SlatprepError):
 
 
 class UnknownAssetError(StoreError, ConfigError):
-    """A name that no asset of a store has, or several: the caller's mistake, not the store's."""
+    """A name that matches no asset of a store, or several: the caller's mistake."""
 
 
 @contextmanager
 def needing(what: str, extra: str, kind: type[SlatprepError] = ConfigError) -> Iterator[None]:
-    """Import an optional package; an error that says how to install it where that fails."""
+    """Raise an error that says how to install a package if its import in the block fails."""
     try:
         yield
     except ImportError as error:

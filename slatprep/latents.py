@@ -1,4 +1,4 @@
-"""The latents of a source asset by asset: of a store, or of files that TRELLIS or others wrote."""
+"""Read the latents of a source (a store, or files of TRELLIS and others) asset by asset."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from slatprep.store.assets import match_id
 from slatprep.store.reader import is_store
 
 _ASKED = 8
-"""Files that are read to tell whether latents have been standardised, where one does not."""
+"""Number of files read to find out whether latents are standardised, if one does not tell."""
 
 
 class LatentsReader:
-    """Reads a source, a store or files, asset by asset; skips latents that cannot be read.
+    """Reader of a source, a store or files, by asset; skips latents that cannot be read.
 
-    `note` gets what is taken for granted, `problem` why an asset is left out.
+    `note` receives assumptions, and `problem` the reason why an asset is left out.
 
     Raises
     ------
@@ -69,7 +69,7 @@ class LatentsReader:
             yield latents
 
     def leave_out(self, error: InputError | StoreError) -> None:
-        """Say why an asset is left out, and count it."""
+        """Report why an asset is left out, and keep the reason in `problems`."""
         self.problems.append(str(error))
         self.problem(f"slatprep: {error}")
 
@@ -100,7 +100,7 @@ class LatentsReader:
 
     @cached_property
     def _moments_of_files(self) -> list[tuple[int, LatentMoments]]:
-        """Voxels and moments of the first files that can be read."""
+        """Number of voxels and moments of each of the first files that can be read."""
         known = []
         for file in [one for one in self.files.values() if not one.problem][:_ASKED]:
             with suppress(InputError, StoreError):
@@ -121,13 +121,13 @@ class LatentsReader:
 
 
 def _size(space: LatentSpace, other: LatentSpace) -> str:
-    """Say how wide latents are, and of which grid where the other's is not the same."""
+    """Return the number of channels in words, with the grid if it differs from the other's."""
     grid = "" if space.resolution == other.resolution else f", a grid of {space.resolution}^3"
     return f"{space.channels} channels{grid}"
 
 
 def _require_encoder(source: Place, held: LatentSpace, space: LatentSpace) -> None:
-    """Refuse latents of another encoder; equal widths and moments mean the same encoder."""
+    """Refuse latents of another encoder; equal channels, grid and means count as the same."""
     same = (held.channels, held.resolution) == (space.channels, space.resolution)
     if not same or (held.encoder != space.encoder and held.mean != space.mean):
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Physical properties to [-1, 1] and back.
+"""Normalise physical properties to [-1, 1] and back.
 
 A property is mapped to log10 of its SI value (Young's modulus, density) or stays as it is
 (Poisson's ratio), as its table says. The mapped value v of a range lo..hi becomes ``2 (v - lo) /
@@ -27,13 +27,13 @@ PIXIE_RANGES = Normalization(
 
 _Table = Sequence[Property | PropertyRange]
 
-# A property with one value in the whole dataset has no range of its own; this
-# much on either side of it makes the mapping defined and sends it to 0.
+# A property with one value in the whole dataset has no range. This width on either
+# side of the value makes the mapping defined and maps the value to 0.
 _HALF_WIDTH_OF_A_POINT = 0.5
 
 
 def to_mapped(properties: ArrayLike, table: _Table = PROPERTIES) -> NDArray[np.float64]:
-    """Map SI properties (N, P) to their log10 where the table says so; the others stay."""
+    """Map SI properties (N, P) to their log10 if the table says so; the others stay."""
     mapped = np.array(properties, dtype=np.float64)
     for column, one in enumerate(table):
         if one.log10:
@@ -54,12 +54,12 @@ def property_extent(
 ) -> NDArray[np.float64]:
     """Return minimum and maximum (P, 2) of each mapped property over a field's annotated voxels.
 
-    The properties are those of `table`, by default the field's; NaN where the field lacks one.
+    The properties are those of `table`, by default the field's; NaN if the field lacks one.
     """
     table = field.table if table is None else table
     own = {one.name: column for one, column in zip(field.table, field.properties.T, strict=True)}
-    # log10 is monotonic, so it is taken of a few numbers and not of the whole field.
-    # By column: numpy takes ten times as long along the first axis of a narrow array.
+    # log10 is monotonic, so it is taken of minima and maxima only. Columns are reduced one
+    # by one, as numpy takes ten times as long along the first axis of a narrow array.
     missing = np.array([np.nan], dtype=np.float32)
     columns = [own.get(one.name, missing) for one in table]
     ends = [[c.min() for c in columns], [c.max() for c in columns]]
@@ -71,7 +71,8 @@ def ranges_from_extents(
 ) -> Normalization:
     """Return the ranges that span a dataset with extents (A, P, 2) from `property_extent`.
 
-    The ranges record their `source`. ValueError without assets, or if an extent is not finite.
+    The ranges record their `source`. Raise ValueError without assets, or if an extent is not
+    finite.
     """
     ends = np.asarray(extents, dtype=np.float64).reshape(-1, len(table), 2)
     if len(ends) == 0 or not np.isfinite(ends).all():
@@ -85,7 +86,7 @@ def ranges_from_bounds(
     source: str,
     table: Sequence[Property] = PROPERTIES,
 ) -> Normalization:
-    """Return the ranges between bounds (P,) of the mapped properties; a point gets a width."""
+    """Return the ranges between bounds (P,) of the mapped properties; equal bounds are spread."""
     single = hi <= lo
     lo, hi = lo - single * _HALF_WIDTH_OF_A_POINT, hi + single * _HALF_WIDTH_OF_A_POINT
     return normalization_of(np.stack([lo, hi], axis=1), source, table)
@@ -110,7 +111,7 @@ def normalize_properties(
         In SI units, a column for each range (Young's modulus [Pa], density
         [kg/m^3] and Poisson's ratio by default); NaN passes through.
     normalization : Normalization
-        The ranges; Pixie's published ones by default. A store's own are
+        The ranges; Pixie's published ranges by default. Those of a store are
         ``store.normalization``.
 
     Returns
@@ -133,10 +134,10 @@ def normalize_and_count(
     properties: ArrayLike, normalization: Normalization
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Normalise as `normalize_properties`, and count the clipped values per property (P,)."""
-    # A column after the other in memory: along rows as narrow numpy takes twice the time.
+    # Columns are made contiguous, as numpy takes twice the time along such narrow rows.
     given = np.asfortranarray(_in_columns(properties, normalization))
     mapped = to_mapped(given, normalization.ranges)
-    # Counted after rounding: a range's own end point must not count as clipped.
+    # Values are counted after rounding, so that a range's own end does not count as clipped.
     values = normalize_mapped(mapped, normalization).astype(np.float32)
     clipped = (np.abs(values) > 1.0).sum(axis=tuple(range(values.ndim - 1)))
     return np.clip(values, -1.0, 1.0), clipped
@@ -175,7 +176,7 @@ def _in_columns(values: ArrayLike, normalization: Normalization) -> NDArray[Any]
 
 
 def change_ranges(values: ArrayLike, old: Normalization, new: Normalization) -> NDArray[np.float64]:
-    """Bring values (N, P) normalised by some ranges to others; nothing is clipped."""
+    """Convert values (N, P), normalised by `old` ranges, to `new` ones; nothing is clipped."""
     return normalize_mapped(_undone(values, old), new)
 
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from slatprep.geometry.nearest import Lattice
 
 NEAR_POWER, NEAR_SHARE = float(np.log10(2.0)), 0.2
-"""How far a property may lie off the merged one to count as the same: in log10, a factor of two,
-or as a share of the merged value where it is not normalised by log10."""
+"""Largest deviation from the merged property that counts as the same: a factor of two (in log10),
+or a share of the merged value if log10 does not normalise the property."""
 
 
 def sample(
@@ -41,13 +41,14 @@ def sample(
     """Look class and properties up at the places (N, 3) of SLAT voxels in the PixieVerse frame.
 
     Each place takes the values of the nearest annotated voxel (SLAT-Phys, "Physics-to-SLAT
-    Annotation Alignment"), or of the nearest of the class that the annotated voxels around it vote
-    for. Background and unannotated voxels never count. Places are rounded to float32 first, because
-    a store holds them so and the labels follow from what it holds.
+    Annotation Alignment"). With the method ``vote`` it takes the values of the nearest voxel of the
+    class that wins a vote of the annotated voxels around it. Background and unannotated voxels
+    never count. Places are rounded to float32 first, as a store holds them, so that labels follow
+    from the store.
 
-    The result is in SI units, NaN and 255 where not valid. ``distance`` [voxel] is to the voxel
-    whose values were taken. Where not valid it is to the nearest, or infinite with `labels_alone`,
-    which is faster.
+    The result is in SI units. Voxels that are not valid have NaN and the class 255. ``distance``
+    [voxel] is to the voxel whose values were taken. For a voxel that is not valid it is to the
+    nearest, or infinite with `labels_alone`, which is faster.
     """
     lattice = lattice_of(field)
     place = np.asarray(places, dtype=np.float32)
@@ -68,7 +69,7 @@ def sample(
 
 @lru_cache(maxsize=1)
 def lattice_of(field: MaterialField) -> Lattice:
-    """Return the field's annotated voxels by cell; cached, for repeated lookups in a field."""
+    """Return the lattice of the field's annotated voxels, cached for repeated lookups."""
     from slatprep.geometry.nearest import Lattice
 
     return Lattice(field.voxels)
@@ -77,20 +78,20 @@ def lattice_of(field: MaterialField) -> Lattice:
 def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annotation:
     """Merge several annotations of the same SLAT voxels, from `in_table`, each with its confidence.
 
-    At each voxel only valid annotations count. A property is their mean, of log10 where `table`
-    says so; the class is the most frequent one, at a tie the lowest id. The voxel is valid if at
-    least one annotation gives each property, and one the class. Place and distance come from the
-    first annotation. The spread is the square root of the mean squared deviation.
+    At each voxel only valid annotations count. A property is their mean, of log10 if `table` says
+    so. The class is the most frequent one; the lowest id wins a draw. A voxel is valid if at least
+    one annotation gives each property and at least one gives the class. Place and distance come
+    from the first annotation. The spread is the square root of the mean squared deviation.
 
-    The confidence is the mean over the valid annotations of theirs, times 0 for another class, 1/2
-    if a property is far from the merged one, and 1 otherwise.
+    The confidence is the mean of the valid annotations' confidences, each times a factor. It is 0
+    for another class, 1/2 if a property is far from the merged one, and 1 otherwise.
     """
     valid = np.stack([one.valid for one in annotations])
     mapped = np.stack([to_mapped(one.properties, table) for one in annotations])
     there = ~np.isnan(mapped)
     count = there.sum(axis=0)
     of = np.maximum(count, 1)
-    # Relative to the largest: equal values then have exactly that mean, and spread 0.
+    # Values are taken relative to the largest, so that equal ones have exactly spread 0.
     most = np.where(there, mapped, -np.inf).max(axis=0)
     mean = most + np.where(there, mapped - most, 0.0).sum(axis=0) / of
     apart = np.where(there, mapped - mean, 0.0)
@@ -126,7 +127,7 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
 
 
 def lacking(field: MaterialField, contents: Contents) -> tuple[str, ...]:
-    """Return what a store has and a field lacks: names of properties, ``classes``."""
+    """Return the names of properties, and ``classes``, that a store has and a field lacks."""
     own = {one.name for one in field.table}
     missing = tuple(one.name for one in contents.properties if one.name not in own)
     return (*missing, "classes") if contents.classes and not field.classified else missing

@@ -164,9 +164,8 @@ class Pair:
     def places(self, poses: Sequence[Pose], affines: Array | None = None) -> Array:
         """Return poses as points in 12 dimensions whose distances are those of `apart`.
 
-        Over samples of mean m and covariance L L^T, the mean square of A x + b is
-        the sum of squares of A L and of A m + b. The `affines` (n, 3, 4) are applied before the
-        poses.
+        For samples of mean m and covariance L L^T, the mean square of A x + b is the sum of
+        squares of A L and A m + b. The `affines` (n, 3, 4) are applied before the poses.
         """
         all_poses = Poses.of([pose.similarity for pose in poses])
         inverse = all_poses.rotations.transpose(0, 2, 1) / all_poses.scales[:, None, None]

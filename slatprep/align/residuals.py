@@ -71,7 +71,7 @@ class Residuals:
 
     @property
     def places(self) -> Array:
-        """Where the samples of both sides lie in the SLAT frame (N, 3), as last measured."""
+        """Positions (N, 3) of the samples of both sides in the SLAT frame, as last measured."""
         return self._lines.places
 
     def normals(self) -> Array:

@@ -1,8 +1,9 @@
 """Robust Gauss-Newton for similarities between two distance fields; compiled.
 
 Unknowns are a twist of the PixieVerse side in the SLAT frame (rotation w, shift
-v), the logarithm of its scale, and an offset o between the two distances, all
-about the centre c of the SLAT samples. With F = s f_P(T^-1 x) the PixieVerse
+v), the logarithm of its scale, and an offset o between the two distances. The
+centre of rotation and scale is the centre c of the SLAT samples. With F = s f_P(T^-1 x) the
+PixieVerse
 distance carried to the SLAT frame, the residuals are
 
     r = F(x) - f_S(x) - o            at SLAT samples x,
@@ -79,9 +80,9 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
     object. Their samples would make the object smaller.
 
     Take one Gauss-Newton step for each of `taus` (voxels), and stop once a step moves the object's
-    rim by less than `tolerance` voxels. Return a row (4,) for each pose: the mean kernel at tau = 1
-    voxel over the SLAT's and over the PixieVerse samples, the share of samples within one voxel,
-    and their rms residual.
+    rim by less than `tolerance` voxels. Return an array (n, 4), a row for each pose.
+    Its columns are the mean kernel at tau = 1 voxel of the SLAT samples, that of the PixieVerse
+    samples, the share of all samples within one voxel, and their rms residual.
     """
     centre = centre_of(slat)
     scale_low, scale_high = scale_bounds

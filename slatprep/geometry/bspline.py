@@ -1,7 +1,7 @@
 """Uniform cubic B-splines on a lattice of control points; the compiled inner loops.
 
-A displacement u(x) = sum_ijk B(a - i) B(b - j) B(c - k) C_ijk, where (a, b, c)
-is x in units of the lattice's spacing: 64 control points move each point.
+A displacement is u(x) = sum_ijk B(a - i) B(b - j) B(c - k) C_ijk, where (a, b, c)
+is x in units of the lattice's spacing. 64 control points move each point.
 Coefficients are (n0, n1, n2, 3). The splines' domain is the n - 3 spans of each
 axis. A point outside has the displacement of the domain's nearest point.
 """

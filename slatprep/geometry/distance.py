@@ -1,7 +1,7 @@
 """The exact signed distance to the faces of a voxel solid; a compiled inner loop.
 
 The squared distance to a set separates by axis (Felzenszwalb and Huttenlocher,
-"Distance Transforms of Sampled Functions", 2012): the distance along one axis
+"Distance Transforms of Sampled Functions", 2012). The distance along one axis
 is a running count, and each further axis takes the minimum of ``f(i') + (i - i')^2``.
 Near a surface the minimum lies within a few voxels, and several rows are searched at
 once in 16-bit integers. At this size that is three times as fast as the lower envelope

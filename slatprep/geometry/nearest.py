@@ -107,7 +107,7 @@ def _cells() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     offsets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     floors = (np.maximum(np.abs(offsets) - 0.5, 0.0) ** 2).sum(axis=1)
     order = np.argsort(floors, kind="stable")
-    # Voxels beyond the reach may be as near as `_SURE`, so no farther cell can be sure.
+    # Voxels beyond the reach may lie at `_SURE` already, so farther cells prove nothing.
     sure = floors[order] <= _SURE**2
     return offsets[order][sure].astype(np.int64), floors[order][sure]
 
