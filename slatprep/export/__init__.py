@@ -81,8 +81,8 @@ def export_store(
     assets : str, or sequence of str or int
         Ids, beginnings of ids, or numbers; empty takes all.
     verdicts : str or sequence of str, optional
-        Only assets with one of these verdicts; empty or ``all`` takes all. By default `assets`
-        with any verdict, or without them all good and doubtful assets.
+        Only assets with one of these verdicts; empty or ``all`` takes all. By default `assets` are
+        taken with any verdict; if `assets` is empty, all good and doubtful ones are.
     options : ExportOptions, optional
         Options of some formats.
     jobs : int
@@ -165,7 +165,7 @@ def _entry(written: Exported) -> _Entry:
 
 
 def _about(store: Store, format: str) -> dict[str, Any]:
-    """Return the description of the store in every export, JSON-ready."""
+    """Return the description of the store that every export has, JSON-ready."""
     attributes = store.attributes
     return {
         "format": target.FORMAT,

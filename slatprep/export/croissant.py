@@ -83,7 +83,7 @@ class Stated:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """The options of what is not stated though catalogues ask for it."""
+        """Options for metadata that catalogues ask for and that are not stated."""
         asked = ("license", "cite_as", "url", "date_published")
         return tuple(f"--{name.replace('_', '-')}" for name in asked if not getattr(self, name))
 
@@ -106,7 +106,7 @@ def describe(store: Store, stated: Stated | None = None, location: str = "") -> 
     """Describe a store as a Croissant dataset: JSON-LD, JSON-ready, the same for the same store.
 
     `location` is the path or URL of the store for readers; by default its name. Croissant's
-    validator warns of what `stated` leaves empty.
+    validator warns of metadata that `stated` leaves empty.
     """
     location, stated = location or store.name, stated or Stated()
     more = {
@@ -130,7 +130,7 @@ def describe(store: Store, stated: Stated | None = None, location: str = "") -> 
 
 
 def description_of(contents: Contents) -> str:
-    """Say in a sentence what a store holds."""
+    """Return a sentence on the contents of a store."""
     names = [one.title for one in contents.properties] + ["material class"] * bool(contents.classes)
     listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
     pixieverse = (contents.properties, contents.classes) == (PROPERTIES, MATERIAL_CLASSES)

@@ -1,4 +1,4 @@
-"""What formats of an export share: their interface, their options, and what assets give them."""
+"""Code that all export formats share: their interface, their options, and the data of assets."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Exported(NamedTuple):
 
 
 def verdicts_of(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the verdicts that words name, none where all are; ConfigError for another word."""
+    """Return the verdicts that words name, none for ``all``; ConfigError for an unknown word."""
     words = words_of(words)
     for one in sorted(words):
         require_one_of("verdict", one, (*Verdict, "all"))
@@ -90,7 +90,7 @@ class AnnotatedPoints(NamedTuple):
 
 
 def require_solver_classes(store: Store) -> None:
-    """Raise StoreError for a store with other classes than those that a solver knows."""
+    """Raise StoreError if a store has other classes than PhysGaussian's, which solvers know."""
     if store.contents.classes not in (MATERIAL_CLASSES, ()):
         raise StoreError(
             f"{store.path} has classes of its own ({', '.join(store.contents.classes)}); expected "
@@ -138,7 +138,7 @@ class ExportOptions:
     size : float
         USD: width of the unit cube [m].
     materials : int
-        USD: the most materials that E and nu of an asset are binned into.
+        USD: most materials into which E and nu of an asset are binned.
     """
 
     points: Points | None = None
@@ -151,7 +151,7 @@ class ExportOptions:
 
 @dataclass(frozen=True)
 class Writer:
-    """How the files of an export are written.
+    """Functions that write the files of an export.
 
     Attributes
     ----------
@@ -167,8 +167,8 @@ class Writer:
     remarks : callable
         Takes the index's entries; returns remarks on the result for the user.
     is_export : callable, optional
-        Only for an export in a single file, which one process writes: whether an existing
-        file is such an export, so that it may be replaced.
+        Only for an export in a single file, which one process writes: returns whether an
+        existing file is such an export, so that it may be replaced.
     """
 
     write: Callable[..., Iterable[Exported]]
@@ -179,7 +179,7 @@ class Writer:
 
 
 def one_by_one(write: Callable[[Path, StoredAsset], Exported]) -> Writer:
-    """Return the writer of a file for each asset, which `write` puts into a folder."""
+    """Return a writer of one file for each asset, which `write` puts into a folder."""
     return Writer(partial(_write_each, write))
 
 

@@ -95,7 +95,7 @@ class _LateFaults(io.FileIO):
 
 
 def is_export(path: Path) -> bool:
-    """Whether a file is an HDF5 export of slatprep."""
+    """Return whether a file is an HDF5 export of slatprep."""
     import h5py
 
     try:

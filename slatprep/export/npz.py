@@ -1,10 +1,10 @@
 """npz files of arrays: for TRELLIS's dataset, in shards for WebDataset, and for VoMP's scripts.
 
-TRELLIS's dataset of structured latents loads ``latents/<model>/<sha256>.npz``, which it chooses and
-finds by the columns of ``metadata.csv`` (its ``DATASET.md`` and ``trellis/datasets``); the targets
-are added. A shard is a tar file in which the members with one key are a sample. The array
-``voxel_data`` has the fields of VoMP's dataset and of its predictions
-(https://github.com/nv-tlabs/vomp). Its scripts for warp.fem, Newton and libuipc look them up at
+TRELLIS's dataset of structured latents loads ``latents/<model>/<sha256>.npz``. It chooses and finds
+these files by the columns of ``metadata.csv`` (its ``DATASET.md`` and ``trellis/datasets``). This
+export adds the targets to them. A shard is a tar file in which the members with one key are a
+sample. The array ``voxel_data`` has the fields of VoMP's dataset and of its predictions
+(https://github.com/nv-tlabs/vomp). VoMP's scripts for warp.fem, Newton and libuipc read them at
 their own points.
 """
 
@@ -72,7 +72,7 @@ def write_latents(model: str, directory: Path, asset: StoredAsset) -> Exported:
 
 
 def _arrays(asset: StoredAsset, *names: str) -> dict[str, Any]:
-    """Return arrays of an asset by name, and those of merged labels where the store has them."""
+    """Return arrays of an asset by name, with the arrays of merged labels if the store has them."""
     merged = MERGED_COLUMNS if asset.store.merges else ()
     return {name: getattr(asset, name) for name in (*names, *merged)}
 

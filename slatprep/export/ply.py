@@ -42,13 +42,13 @@ VERTEX = np.dtype(
 """The fields of a point in Pixie's order; density in kg/m^3, E in Pa."""
 
 UNITS = "density kg/m^3, E Pa, nu 1"
-"""The units, a comment in every PLY written here."""
+"""Comment on the units in every PLY of slatprep."""
 
 COMMENTS: dict[Frame, str] = {
     "slat": "frame SLAT, unit cube -0.5..0.5, z up",
     "pixieverse": "frame PixieVerse, world coordinates of its bounds",
 }
-"""The frame, a comment in every PLY of an asset."""
+"""Comment on the frame in a PLY of an asset."""
 
 Bounds = NDArray[np.float64]
 """Smallest and largest world coordinates of a field, (2, 3)."""

@@ -100,8 +100,8 @@ def publish_store(
 
 
 def _copy(store: Store, local: Path, to: Path) -> None:
-    """Copy a store whose files are all what its digests say."""
-    # First, as an error while copying is taken for one of writing.
+    """Copy a store; StoreError if a file differs from its digest."""
+    # Files are checked first, as an error while copying counts as an error of writing.
     _, findings = file_findings(store, jobs=1)
     for finding in sorted(findings, key=str):
         raise StoreError(f"{local}/{finding}; `slatprep verify` says more")

@@ -86,7 +86,7 @@ def _remove_killed(out: Path) -> None:
             held = _locked(work)
             try:
                 state, names = os.fstat(held), [path.name for path in work.iterdir()]
-                # A folder that is still empty may get a lock in a moment.
+                # An empty folder may be new, and not locked yet.
                 killed = names == [_NEW] or (not names and time.time() - state.st_mtime > 60)
                 if killed and state.st_uid == os.getuid():
                     shutil.rmtree(work, ignore_errors=True)
@@ -117,7 +117,7 @@ def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, A
 def _files_of_export(out: Path, kind: str) -> frozenset[str] | None:
     """Return the names of an export's files and folders; None if `out` is not an export.
 
-    ConfigError if it is one of another kind, which is hardly meant to go.
+    ConfigError if it is an export of another kind, which the user hardly wants to lose.
     """
     if not out.is_dir():
         return None

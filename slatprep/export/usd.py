@@ -51,7 +51,7 @@ def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> 
     least = len(YIELDING)
     if options.materials < least:
         raise ConfigError(f"materials is {options.materials}; expected {least} or more")
-    if not 1e-6 <= options.size <= 1e6:  # float32 holds the masses of no others.
+    if not 1e-6 <= options.size <= 1e6:  # float32 cannot hold the masses of others.
         raise ConfigError(f"size is {options.size:g}; expected a length of 1e-06 to 1e+06 m")
     formats.require_solver_classes(store)
     _pxr("Usd")
@@ -87,7 +87,7 @@ def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]])
     """Write the scene: gravity, ground, and a reference to each asset; return its name."""
     geom, tf = _pxr("UsdGeom", "Tf")
     stage, _ = _stage(directory / SCENE, "/World")
-    # The grid of the solver is one for all: as fine as the finest asset needs.
+    # The solver has one grid for all assets: as fine as the finest needs.
     _simulation(stage, "/World", min(entry["spacing"] for entry in entries))
     columns = int(np.ceil(np.sqrt(len(entries))))
     for number, entry in enumerate(entries):
@@ -96,7 +96,7 @@ def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]])
         one = geom.Xform.Define(stage, f"/World/{label}")
         one.GetPrim().GetReferences().AddReference(f"./{entry['file']}")
         one.GetPrim().SetCustomDataByKey("slatprep:asset_id", entry["asset_id"])
-        # Beside the operation of the asset's file, which lifts it onto the ground.
+        # A second operation: that of the asset's file lifts it onto the ground.
         place = one.AddTranslateOp(opSuffix="place")
         place.Set(tuple(float(_PITCH * size * step) for step in (column, row, 0)))
     stage.GetRootLayer().Save()
@@ -168,7 +168,7 @@ def _add_material(
 
 
 def _simulation(stage: Any, parent: str, width: float) -> None:
-    """Add what a simulation needs beside particles `width` [m] wide: solver, gravity, ground."""
+    """Add solver, gravity and ground for a simulation of particles `width` [m] wide."""
     geom, physics, sdf = _pxr("UsdGeom", "UsdPhysics", "Sdf")
     scene = physics.Scene.Define(stage, f"{parent}/PhysicsScene")
     scene.CreateGravityDirectionAttr((0.0, 0.0, -1.0))
@@ -206,7 +206,7 @@ def _stage(path: Path, name: str) -> tuple[Any, Any]:
 
 
 def _edge(asset: StoredAsset, points: formats.Points) -> float:
-    """Return the edge of a voxel in the unit cube of the SLAT, such that its volume is right."""
+    """Return the edge in the SLAT's unit cube of a cube with the volume of a voxel."""
     if points == "slat":
         return 1.0 / asset.store.contents.latents.resolution
     scale = float(np.cbrt(np.abs(np.linalg.det(asset.transform[:3, :3]))))
@@ -214,7 +214,7 @@ def _edge(asset: StoredAsset, points: formats.Points) -> float:
 
 
 def _remarks(entries: Sequence[dict[str, Any]]) -> tuple[str, ...]:
-    """Say what binning and clipping changed."""
+    """Return remarks on what binning and clipping changed."""
     modulus = max(entry["E_error"] for entry in entries)
     ratio = max(entry["nu_error"] for entry in entries)
     most = max(entry["materials"] for entry in entries)
@@ -234,10 +234,10 @@ def _pxr(*names: str) -> list[Any]:
 
 
 _FINEST = 1e-6
-"""Relative width of the finest bins of E; values that differ by less are float32's rounding."""
+"""Relative width of the finest bins of E; smaller differences are float32's rounding."""
 
 _RATIO = 0.25
-"""Width of a bin of nu for one of E of relative width 1: 0.25 spans the usual range."""
+"""Width of the bins of nu if the bins of E have relative width 1: 0.25 spans the usual range."""
 
 
 class Binned(NamedTuple):
@@ -255,7 +255,7 @@ def bin_materials(material: NDArray[np.uint8], solid: NDArray[np.float64], most:
     """Bin rows of a class, E, density, nu (N, 3) into at most `most` materials.
 
     Bins are as fine as `most` allows, and no bin has rows of two classes. E and nu of a bin
-    lie in the middle of its members (E in its logarithm), so that the largest error is least.
+    lie in the middle of its members (E in its logarithm), which makes the largest error least.
     """
     from scipy import ndimage
 
@@ -287,7 +287,7 @@ def bin_materials(material: NDArray[np.uint8], solid: NDArray[np.float64], most:
 
 
 def _cover(values: NDArray[np.float64], width: float, most: int) -> NDArray[np.intp] | None:
-    """Return the bin of each value (N,), the fewest of a width; None if they are over `most`."""
+    """Return the bin of each value (N,), with the fewest bins of `width`; None if above `most`."""
     ordered = np.unique(values)
     starts: list[int] = []
     next_start = 0

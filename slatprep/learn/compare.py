@@ -63,14 +63,14 @@ class Comparison:
     spread : str
         The kind of `Measure.spreads`, one of `slatprep.learn.metrics.SPREADS`.
     methods : dict of str to Measure
-        By the method's name, over all objects.
+        Scores over all objects, by the method's name.
     categories : dict of str to dict of str to Measure
-        By category, then by method.
+        Scores by category, then by method.
     partly_annotated : int
         Objects with occupied voxels that are not annotated and so not scored. Pixie's loader
         leaves such objects out.
     problems : list of str
-        Why assets of the split were left out; they are left out of all methods.
+        Why assets of the split were left out of the scores of all methods.
     """
 
     spread: Spread
@@ -91,11 +91,11 @@ def compare_methods(
 ) -> Comparison:
     """Measure predictions of SLAT voxels and predicted grids against a store.
 
-    A grid is measured twice. On its own voxels, by Pixie's protocol (vlongle/pixie,
+    A grid is measured twice. Its own voxels are measured by Pixie's protocol (vlongle/pixie,
     ``inference_combined.py``): squared errors in normalised space and class accuracy, means over
     the object's annotated voxels, then over objects. A voxel predicted as background has the wrong
-    class; its properties count, and no prediction is clipped. At the SLAT's voxels, the grid's
-    values are looked up as the store's labels were, at the stored places. The grid that the labels
+    class, but its properties count, and no prediction is clipped. At the SLAT's voxels, the grid's
+    values are sampled as the store's labels were, at the stored places. The grid that the labels
     were made from therefore has no error there.
 
     `predictions` is read by `slatprep.learn.predictions.open_predictions`, a file of `grids` by
@@ -164,7 +164,7 @@ class _Truth:
         ranges = self.store.normalization
         properties, material = read_prediction(path, root, annotated, ranges)
         require_normalised(path, properties)
-        # The values are normalised ones: the lookup copies them whatever their unit.
+        # These values are normalised; the lookup copies them without regard to a unit.
         field = MaterialField(
             occupancy=annotated,
             voxels=voxels_of(annotated),
@@ -195,7 +195,7 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
 def draw_comparison(methods: Measures, what: str, form: str) -> bytes:
     """Draw a panel for each metric, with the mean and spread of each method.
 
-    `what` says in words which kind of spread it is, `form` is png, svg or pdf.
+    `what` names the kind of spread, `form` is png, svg or pdf.
     """
     from matplotlib.figure import Figure
 

@@ -73,7 +73,7 @@ class SparseBatch:
     Attributes
     ----------
     asset_ids : list of str
-        By the value of the batch column.
+        Ids by the value of the batch column.
     coords : Tensor of int32, shape (N, 4)
         Batch column, then the voxel.
     feats, properties, material, valid, confidence : Tensor
@@ -127,17 +127,16 @@ class SlatDataset(Dataset[Item]):
     max_ambiguity : float, optional
         Only assets with at most this ambiguity.
     min_confidence : float, optional
-        Voxels whose class is right with less probability are not valid.
+        Least probability that a voxel's class is right for the voxel to be valid.
     augmentation : {"none", "upright", "all"}
         Symmetries of the lattice to draw from, see `slatprep.learn.augment`.
     seed : int
-        With the epoch and the asset's id, decides which symmetry is drawn.
+        Decides, with the epoch and the asset's id, which symmetry is drawn.
 
     Raises
     ------
     ConfigError
-        If no asset is left, confidence is asked for and the store has none, or `augmentation` is
-        none of the above.
+        If no asset is left, or the split, a verdict or `augmentation` is unknown.
     StoreError
         If the store cannot be read.
     """
@@ -251,7 +250,7 @@ class SlatLoader(DataLoader[SparseBatch]):
     workers : int
         Processes that read ahead; 0 reads in this process.
     start_method : {"fork", "spawn", "forkserver"}, optional
-        How they are started; by default as the platform does.
+        How the processes are started; by default as usual on the platform.
     pin_memory : bool
         Whether to pin batches in memory, for faster copies to a GPU.
 
@@ -288,5 +287,5 @@ class SlatLoader(DataLoader[SparseBatch]):
         )
 
     def set_epoch(self, epoch: int, batches: int = 0) -> None:
-        """Set the epoch, which decides order and augmentation; leave out its first batches."""
+        """Set the epoch, which decides order and augmentation; skip its first `batches`."""
         self.order.epoch, self.order.first = epoch, batches * (self.batch_size or 1)

@@ -1,6 +1,6 @@
 """Pixie's protocol as SLAT-Phys states it: means over voxels, then over objects.
 
-Beside predictions it measures two reference models: the training mean, and a linear model of
+Two reference models are measured beside predictions: the training mean, and a linear model of
 single voxels.
 """
 
@@ -61,7 +61,7 @@ COLUMNS = ("coords", "feats", "properties", "material", "valid")
 """The arrays of an asset that a baseline is fitted to and measured on."""
 
 Rows = Mapping[str, NDArray[Any]]
-"""Those arrays by name, as `Store.read` returns them."""
+"""Arrays of an asset by name, as `Store.read` returns them."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,9 @@ class Evaluation:
     spread : str
         The kind of `Measure.spreads`, see `SPREADS`.
     overall : Measure
-        Over all objects.
+        Scores over all objects.
     categories : dict of str to Measure
-        Over the objects of each category.
+        Scores over the objects of each category.
     missing : list of str
         Assets of the split without a prediction; they are not in the scores.
     converted : int
@@ -114,7 +114,7 @@ class Evaluation:
 def score_asset(prediction: VoxelPrediction, truth: Rows) -> NDArray[np.float64]:
     """Return the metrics (P + 2,) of an asset, in the order of `metrics_of`.
 
-    They are means over its valid voxels, of which there must be one. `truth` has ``properties``
+    They are means over its valid voxels, at least one. `truth` has ``properties``
     (N, P) in [-1, 1], ``material`` (N,) and ``valid`` (N,). Accuracy is NaN if no class was
     predicted.
     """
@@ -156,7 +156,7 @@ def average_methods(
     """Average the metrics of methods over assets per object, then over objects.
 
     `scored` has the metrics (metrics,) of each method by asset. The views of an object count as one
-    object. Returned are the measures over all objects, and those by category.
+    object. Returns the measures over all objects, and the measures by category.
     """
     objects, categories = (
         np.array([str(column[index]) for index in scored])
@@ -227,9 +227,9 @@ class VoxelBaseline:
     Attributes
     ----------
     name : str
-        What tables and pictures call it.
+        Its name in tables and pictures.
     weights : ndarray of float64, shape (channels + 4, P + classes)
-        From latents, position and 1 to properties and class indicators.
+        Map from latents, position and 1 to properties and class indicators.
     properties : int
         Number of properties P.
     """
@@ -274,6 +274,6 @@ def fit_baselines(store: Store, assets: Iterable[int]) -> tuple[VoxelBaseline, V
 
 
 def _inputs(rows: Rows) -> NDArray[np.float64]:
-    # Of another grid than 64^3 on another scale, which the weights make up for.
+    # Voxels of another grid than 64^3 give another scale, for which the weights compensate.
     position = voxel_centres(rows["coords"])
     return np.hstack([rows["feats"], position, np.ones((len(position), 1))])

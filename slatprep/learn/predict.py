@@ -65,7 +65,7 @@ class PredictedField:
     material : ndarray of uint8, shape (N,)
         The most probable class, below `Contents.n_labels`: a voxel of a SLAT is not background.
     probabilities : ndarray of float32, shape (N, C)
-        Of all classes, background last, with sum 1. Without classes, one column of 1.
+        Probabilities of all classes, background last, with sum 1. Without classes, one column of 1.
     seconds : float
         Time of decoding: the share of its batch by voxels.
     """
@@ -134,7 +134,7 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
 
 
 def _text_in(state: dict[str, Any], name: str) -> str:
-    """Return a text of a checkpoint; anything else could be without end once it is printed."""
+    """Return a text of a checkpoint; TypeError for other types, which may be endless in print."""
     text = state[name]
     if not isinstance(text, str):
         raise TypeError(f"{name} is {type(text).__name__}, not a text")
@@ -142,7 +142,7 @@ def _text_in(state: dict[str, Any], name: str) -> str:
 
 
 def _ranges_in(state: dict[str, Any], count: int) -> NDArray[np.float64]:
-    """Return the ranges (count, 2); lists may hold the same list again and again."""
+    """Return the ranges (count, 2); types are checked first, as nested lists may be endless."""
     rows = state["ranges"]
     if not (isinstance(rows, list) and len(rows) == count):
         raise TypeError(f"ranges are not a list of {count}")
@@ -155,12 +155,12 @@ def _ranges_in(state: dict[str, Any], count: int) -> NDArray[np.float64]:
 
 
 def _contents_in(state: dict[str, Any]) -> Contents:
-    """Return what a decoder was trained on."""
+    """Return the contents of the store that a decoder was trained on."""
     document = orjson.loads(_text_in(state, "contents"))
     document["properties"] = [
         dict(zip(("name", "unit", "log10"), row, strict=True)) for row in document["properties"]
     ]
-    # Without the bounds of values, since JSON has no infinity.
+    # The document has no bounds of values, since JSON has no infinity.
     contents: Contents = adapter_of(Contents).validate_json(orjson.dumps(document), strict=True)
     if not 0 < len(contents.properties) <= MAX_PROPERTIES:
         raise ValueError(f"it has {len(contents.properties)} properties, not 1 to {MAX_PROPERTIES}")

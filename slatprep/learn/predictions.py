@@ -1,7 +1,7 @@
 """Read predictions by asset: npz files, Zarr or HDF5.
 
-The files are not trusted. Nothing is unpickled, no link leads out of them, and arrays of another
-type or shape than a prediction's are not read. Zarr is read without zarr-python: plain arrays by
+The files are not trusted. Nothing is unpickled, links that lead out of them are refused, and so are
+arrays of another type or shape than a prediction's. Zarr is read without zarr-python: plain arrays by
 `slatprep.storage.chunks`, arrays in shards like those of a store.
 """
 
@@ -50,10 +50,10 @@ RUN_BYTES = 2**20
 """Most bytes of a `RUN_FILE`."""
 
 _FARTHEST = 100.0
-"""No decoder errs by so many ranges; SI values, given by mistake, exceed it."""
+"""Largest normalised value that is accepted; SI values, given by mistake, exceed it."""
 
 _MIDDLE = 2.5
-"""Nor half of an asset's values: log10 of Young's modulus, which is 3 to 12, exceeds it."""
+"""Largest median magnitude that is accepted; log10 of Young's modulus, 3 to 12, exceeds it."""
 
 _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a group an asset"
 
@@ -98,9 +98,9 @@ class _Selection:
 
 
 def selection_of_run(predictions: Path) -> tuple[Path, dict[str, Any], dict[str, Any]] | None:
-    """Return which assets the training run beside the predictions chose, None without a run.
+    """Return the choice of assets of the training run beside the predictions, None without a run.
 
-    That is the run's file, the rule of the split as arguments of
+    The choice is the run's file, the rule of the split as arguments of
     `slatprep.learn.splits.assign_store`, and the filters of `slatprep.learn.splits.select_assets`.
     InputError if the file lacks one of them.
     """
@@ -128,7 +128,7 @@ ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]
 
 @contextmanager
 def open_predictions(path: Path) -> Iterator[ReadAsset]:
-    """Open predictions of any form; yield a function that reads those of an asset.
+    """Open predictions of any form; yield a function that reads the arrays of an asset.
 
     They are a folder of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5 file, with ids
     encoded by `slatprep.storage.files.file_name`. InputError if they are none of these.
@@ -152,7 +152,7 @@ def open_predictions(path: Path) -> Iterator[ReadAsset]:
 
 
 def require_normalised(source: str | Place, properties: NDArray[np.float64]) -> None:
-    """Raise InputError, naming `source`, if properties (N, P) are far from normalised ones."""
+    """Raise InputError, naming `source`, if properties (N, P) are far out of the ranges."""
     largest = np.abs(properties).max(initial=0)
     if largest > _FARTHEST:
         expected = "normalised properties, which are -1 to 1 within the ranges, not SI values"
@@ -300,7 +300,7 @@ def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
             try:
                 file = folder.open(name)
             except FileNotFoundError:
-                # zarr leaves out chunks of fill values, and what was lost must not pass as one.
+                # zarr leaves out chunks of fill values, and a lost chunk must not pass as one.
                 what = f"its chunk {name} is missing"
                 raise InputError(path, what, _WHOLE) from None
             with file:

@@ -19,7 +19,7 @@ class PublishedScore:
     method : str
         Name of the method.
     means : dict of str to float
-        By metric, some of `slatprep.learn.metrics.METRICS`.
+        Mean by metric, for some of `slatprep.learn.metrics.METRICS`.
     spreads : dict of str to float
         The number after ± of each metric, if published.
     spread : str
@@ -57,8 +57,8 @@ PIXIE_TABLE = (
 )  # fmt: skip
 """Le et al., "Pixie: Fast and Generalizable Supervised Learning of 3D Physics from Pixels",
 arXiv 2508.17437, Table 1: NeRF2Physics, measured by Pixie's authors, and Pixie with three kinds
-of features. On PixieVerse's test objects, over the voxels of Pixie's grids, normalised by
-Pixie's ranges."""
+of features. Scores are on PixieVerse's test objects, over the voxels of Pixie's grids, normalised
+by Pixie's ranges."""
 
 SLAT_PHYS_TABLE = (
     *(score for score in PIXIE_TABLE if score.method in ("NeRF2Physics", "Pixie")),
@@ -69,8 +69,8 @@ SLAT_PHYS_TABLE = (
     _score("SLAT-Phys, large", 0.0173, 0.0361, 0.0540, 0.0358, 0.9453),
 )  # fmt: skip
 """The tables of SLAT-Phys: its comparison, with rows from Pixie's table, and its ablation of the
-decoder's size (2,000 steps), with the means of the three printed errors. Over SLAT voxels,
-normalised by Pixie's ranges."""
+decoder's size (2,000 steps), with the means of the three printed errors. Scores are over SLAT
+voxels, normalised by Pixie's ranges."""
 
 TABLES = {
     "pixie": ("Pixie's Table 1 (arXiv 2508.17437)", PIXIE_TABLE),
@@ -90,7 +90,8 @@ def read_scores(path: Path) -> tuple[PublishedScore, ...]:
     """Read a table of scores without spreads, such as from ``slatprep evaluate --csv``.
 
     The CSV has the methods' names in the first column and some of the columns "log10 E", "log10
-    density", "nu", "mean" and "accuracy". InputError if it has none, or no number in one.
+    density", "nu", "mean" and "accuracy". InputError if it has none of them, or an entry is no
+    number.
     """
     expected = f"a CSV with a name in the first column and some of {', '.join(METRICS)}"
     try:

@@ -35,10 +35,10 @@ _GLOBALS = ("torch", "collections OrderedDict")
 """Prefixes of the names that a checkpoint's pickle may contain."""
 
 _MAX_PICKLE = 2**20
-"""Bytes of a checkpoint's structure without its tensors; the large decoder's takes 60,000."""
+"""Most bytes of a checkpoint's structure without tensors; the large decoder's takes 60,000."""
 
 _MAX_ENTRIES = 10_000
-"""Members of a checkpoint's archive."""
+"""Most members of a checkpoint's archive."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ def read_state(path: Path) -> dict[str, Any]:
         refusing(path, "cannot be read", "a checkpoint of `slatprep train`"),
         storage_of(path).open() as file,
     ):
-        # zipfile and torch make an object for every entry before one can ask how many there are.
+        # zipfile and torch make an object for every entry before their number can be checked.
         entries = sum(part.count(b"PK\x01\x02") for part in iter(lambda: file.read(2**20), b""))
         if entries > _MAX_ENTRIES:
             raise ValueError(f"it has {entries:,} members, and at most {_MAX_ENTRIES:,} are read")
@@ -95,7 +95,7 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def _check_globals(pickled: bytes) -> None:
-    """Raise where a pickle names more than tensors: torch would also allow a bytearray."""
+    """Raise ValueError if a pickle names more than tensors: torch would allow a bytearray, too."""
     words: list[str] = []
     for operation, argument, _ in pickletools.genops(pickled):
         name = str(argument)
@@ -110,8 +110,8 @@ def _check_globals(pickled: bytes) -> None:
 class Run:
     """The folder of a training run; as a context manager it holds the folder's lock.
 
-    The folder is new, empty, or that of a run, whose `parameters` it then has. ConfigError if it
-    holds something else, StoreError if another process trains into it.
+    The folder is new, empty, or holds a run, whose `parameters` are read. ConfigError if it holds
+    something else, StoreError if another process trains into it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -125,7 +125,7 @@ class Run:
         self._foreign = lock.is_file() and not lock.stat().st_size
         self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
         try:
-            # Only under the lock: another training may have changed the folder before.
+            # Checked only under the lock: another training may have changed the folder before.
             if file.exists():
                 with refusing(file, "cannot be read", "what `slatprep train` wrote"):
                     self.parameters = read_document(file, RUN_BYTES)
@@ -148,8 +148,8 @@ class Run:
     def begin(self, parameters: dict[str, Any], assignment: Assignment) -> None:
         """Write the parameters of a new run, or continue a run with the same parameters.
 
-        The result must depend on nothing else. The objects of each split go into ``splits.json``,
-        their digest into ``run.json``. ConfigError if the run in the folder has other parameters;
+        Parameters and splits must decide the result alone. The objects of each split go into
+        ``splits.json``, their digest into ``run.json``. ConfigError if the run in the folder has other parameters;
         the message names them.
         """
         lists = json.dumps(assignment.lists(), indent=1) + "\n"
@@ -176,7 +176,7 @@ class Run:
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; an existing one is replaced when the new one is complete."""
         buffer = BytesIO()
-        torch.save(state, buffer)  # On a full disk it would not raise an OSError.
+        torch.save(state, buffer)  # Straight to a full disk, it raises no OSError.
         with staged(self.path / name) as path:
             path.write_bytes(buffer.getbuffer())
 
@@ -197,7 +197,7 @@ class Run:
         except ImportError:
             return
         epoch = history[-1].epoch
-        # An epoch that is repeated takes the place of what a killed run has logged of it.
+        # A repeated epoch replaces the entries that a killed run logged for it.
         with SummaryWriter(str(self.path / "tensorboard"), purge_step=epoch) as board:
             for name in names[1:]:
                 board.add_scalar(name, getattr(history[-1], name), epoch)

@@ -42,8 +42,8 @@ def select_assets(
 ) -> NDArray[np.int64]:
     """Return the rows (K,) of the assets in a split, in the order of the store.
 
-    Assets must have one of `verdicts` and at most `max_ambiguity`; those without a number are out.
-    Assets without a valid voxel are out, too: they have no labels. `splits` gives the split of each
+    Assets must have one of `verdicts` and at most `max_ambiguity`; an ambiguity of NaN is too much.
+    Assets without a valid voxel have no labels, and are left out. `splits` gives the split of each
     object by id, by default the split by hash. ConfigError if split or verdict is unknown.
     """
     if split is not None:

@@ -44,7 +44,7 @@ CLASS_WEIGHT = 0.5
 """Weights of SLAT-Phys for the MSE of each property and the cross-entropy of the classes."""
 
 SECONDS_BETWEEN_SAVES = 30.0
-"""How much of an unfinished epoch a stopped training loses at most, beside a step."""
+"""Most seconds of an unfinished epoch that a stopped training loses, apart from one step."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class TrainSummary:
     predictions : Path
         Predictions of the test objects, for `slatprep evaluate`.
     diverged_in : int, optional
-        The epoch whose loss is no finite number, with which training ended.
+        The last epoch, if training ended because its loss is not finite.
     """
 
     history: list[EpochRecord]
@@ -149,9 +149,9 @@ def train(
 
     On a CPU, a resumed run gets the same weights as an uninterrupted one; on a GPU the last bits
     may differ. `workers` processes read ahead. `steps` gets the number of batches done and of all,
-    in this call alone; `stop_after` epochs it stops, as if interrupted. ConfigError if `out` holds
-    another run, a split has no asset, or the training diverged before any epoch was worth keeping;
-    where it diverges later it ends. InputError if a checkpoint is damaged.
+    in this call alone. The training stops after `stop_after` epochs, as if interrupted; it ends if
+    it diverges. ConfigError if `out` holds another run, a split has no asset, or the training
+    diverges before any epoch can be kept. InputError if a checkpoint is damaged.
     """
     opened = open_store(store, copy=True)
     assignment = assign_store(opened, parameters.split_by, parameters.shares)
@@ -186,7 +186,7 @@ def train(
                     f"{out}: the training diverged in epoch {record.epoch}: its loss is no finite "
                     "number; train with a smaller --learning-rate into another --out"
                 )
-            # `LAST` comes last: a run that is killed before it repeats the epoch.
+            # `LAST` is saved last: a run that is killed before that repeats the epoch.
             if session.best_epoch == record.epoch:
                 ranges, holds = opened.normalization, opened.contents
                 run.save(BEST, checkpoint_state(session.model, parameters.size, ranges, holds))
@@ -267,7 +267,7 @@ class _Session:
         self.all_steps = parameters.steps or parameters.epochs * self.steps
         self.epochs = math.ceil(self.all_steps / self.steps)
         self.history: list[EpochRecord] = []
-        self.losses: list[float] = []  # Of the batches of an unfinished epoch.
+        self.losses: list[float] = []  # Losses of the batches of an unfinished epoch.
         self.resumed_at = 0
 
     @property
@@ -282,7 +282,7 @@ class _Session:
         return int(np.argmin(np.nan_to_num(losses, nan=np.inf)))  # NaN where training diverged.
 
     def diverged(self, epoch: int = -1) -> bool:
-        """Whether the loss of an epoch is no finite number, as is that of all after it."""
+        """Return whether the loss of an epoch is not finite; then no later loss is, either."""
         record = self.history[epoch]
         return not math.isfinite(record.train_loss if self.val_set is None else record.val_loss)
 
