@@ -1,7 +1,7 @@
 """Read predictions by asset: npz files, Zarr or HDF5.
 
-The files are not trusted. Nothing is unpickled, links that lead out of them are refused, and so are
-arrays of another type or shape than a prediction's. Zarr is read without zarr-python: plain arrays by
+The files are not trusted. Nothing is unpickled. Links that lead out of them and arrays of another
+type or shape than a prediction's are refused. Zarr is read without zarr-python: plain arrays by
 `slatprep.storage.chunks`, arrays in shards like those of a store.
 """
 

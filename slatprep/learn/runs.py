@@ -148,9 +148,9 @@ class Run:
     def begin(self, parameters: dict[str, Any], assignment: Assignment) -> None:
         """Write the parameters of a new run, or continue a run with the same parameters.
 
-        Parameters and splits must decide the result alone. The objects of each split go into
-        ``splits.json``, their digest into ``run.json``. ConfigError if the run in the folder has other parameters;
-        the message names them.
+        The result must depend on nothing but these. The objects of each split go into
+        ``splits.json``, their digest into ``run.json``. ConfigError if the run in the folder has
+        other parameters; the message names them.
         """
         lists = json.dumps(assignment.lists(), indent=1) + "\n"
         parameters = parameters | {"splits": hashlib.sha256(lists.encode()).hexdigest()}
