@@ -1,6 +1,6 @@
 """Fit the confidences of slatprep.judge on tables of benchmarks/confidence.py, and test them.
 
-    python benchmarks/calibrate.py demo.npz ... [--fit [--module slatprep/judge/calibration.py]]
+    python benchmarks/calibrate.py demo.npz ... [--fit [--numbers slatprep/judge/calibration.json]]
                                    [--picture docs/images/confidence.svg]
 
 Two questions of an alignment: do both sides show the same object, and if they do, is its
@@ -9,7 +9,7 @@ weights may only have the sign that makes sense (a better fit never lowers a con
 voxels then a curve, from isotonic regression on the same rows, that sets their
 probabilities right. Alignments are weighed to the mix `PRIOR`.
 
-With --fit the module gets what is fitted to all tables, and all that is printed and drawn is
+With --fit the file of numbers gets what is fitted to all tables. All that is printed and drawn is
 of objects that had no part in the fit: their seeds are divided into `PARTS`, and each part is
 judged by what is fitted to the others. Without it the shipped numbers are tested, on other objects
 only if those of the tables are.
@@ -18,10 +18,9 @@ only if those of the tables are.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -101,7 +100,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tables", type=Path, nargs="+", help="what is fitted to, and tested")
     parser.add_argument("--fit", action="store_true", help="fit anew")
-    parser.add_argument("--module", type=Path, help="where the numbers go")
+    parser.add_argument("--numbers", type=Path, help="where the numbers go")
     parser.add_argument("--picture", type=Path, help="where the reliability diagram goes")
     options = parser.parse_args()
     table = read_tables(options.tables)
@@ -109,8 +108,8 @@ def main() -> None:
         shipped = Models(calibration.SAME_OBJECT, calibration.PLACEMENT, calibration.VOXEL)
         report(table, *judged(table, shipped), options.picture)
         return
-    if options.module:
-        write_module(options.module, fit_all(table))
+    if options.numbers:
+        write_numbers(options.numbers, fit_all(table))
     report(table, *judged_by_others(table), options.picture)
 
 
@@ -409,25 +408,22 @@ def draw(path: Path, assets: list[Any], voxels: list[Any]) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def write_module(path: Path, models: Models) -> None:
-    """Write the numbers as a module, so that they are part of the code that makes a store."""
-    lines = [
-        '"""The weights of the confidences; written by benchmarks/calibrate.py, not by hand."""',
-        "", "from slatprep.judge.evidence import FIGURES, VOXEL_FIGURES",
-        "from slatprep.judge.model import Figure, Logistic", "",
-        f"SAME_OBJECT = {_written(models.same, 'FIGURES')}",
-        '"""Whether both sides show the same object."""', "",
-        f"PLACEMENT = {_written(models.placement, 'FIGURES')}",
-        '"""Whether a placement is right, of the same object."""', "",
-        f"VOXEL = {_written(models.voxel, 'VOXEL_FIGURES')}",
-        '"""Whether the class of a voxel is right."""',
-    ]  # fmt: skip
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    subprocess.run([sys.executable, "-m", "ruff", "format", "-q", path], check=True)
+def write_numbers(path: Path, models: Models) -> None:
+    """Write the numbers as JSON, a figure and a point of a curve in a line."""
+    told = zip(("same_object", "placement", "voxel"), vars(models).values(), strict=True)
+    text = ",\n".join(f'  "{name}": {_written(model)}' for name, model in told)
+    path.write_text(f"{{\n{text}\n}}\n", encoding="utf-8")
 
 
-def _written(model: Logistic, names: str) -> str:
-    return f"Logistic({names}, {repr(model).removeprefix('Logistic(')}"
+def _written(model: Logistic) -> str:
+    figures, curve = (
+        "[{}]".format(",".join(f"\n      {json.dumps(row)}" for row in rows))
+        for rows in (map(astuple, model.figures), model.curve)
+    )
+    return (
+        f'{{\n    "intercept": {model.intercept},\n    "figures": {figures},\n'
+        f'    "curve": {curve}\n  }}'
+    )
 
 
 if __name__ == "__main__":

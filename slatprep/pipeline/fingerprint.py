@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import hashlib
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -74,8 +75,13 @@ def code_fingerprint() -> str:
 
 
 def _digest_of(modules: Iterable[Path]) -> str:
-    lines = (f"{_dump(_parsed(path.read_bytes()))}\n" for path in modules)
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    """Digest the statements of modules, and the JSON file of a module's name beside it."""
+    digest = hashlib.sha256()
+    for path in modules:
+        digest.update(f"{_dump(_parsed(path.read_bytes()))}\n".encode())
+        with suppress(FileNotFoundError):
+            digest.update(path.with_suffix(".json").read_bytes())
+    return digest.hexdigest()
 
 
 def numeric_modules() -> dict[str, Path]:

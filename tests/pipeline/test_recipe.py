@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from slatprep.judge.calibration import NUMBERS
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.pipeline import fingerprint
 from slatprep.pipeline.dataset import BuildSummary
@@ -73,6 +74,20 @@ def test_statements_count_and_words_do_not(tmp_path, monkeypatch):
     first = of('"""Words."""\n\n\ndef f(x):\n    """More."""\n    return x + 1  # why\n')
     assert of("def f(x):\n    return (x +\n            1)\n") == first
     assert of("def f(x):\n    return x + 2\n") != first
+
+
+def test_numbers_beside_a_module_count(tmp_path, monkeypatch):
+    module, numbers = tmp_path / "m.py", tmp_path / "m.json"
+    monkeypatch.setattr(fingerprint, "numeric_modules", lambda: {"m": module})
+    module.write_text("x = 1\n")
+    digests = [code_fingerprint.__wrapped__()]
+    for text in ("[1.0]", "[1.5]"):
+        numbers.write_text(text)
+        digests.append(code_fingerprint.__wrapped__())
+    assert len(set(digests)) == 3
+    shipped = numeric_modules()["slatprep.judge.calibration"]
+    assert shipped.with_suffix(".json") == NUMBERS
+    assert NUMBERS.is_file()
 
 
 def test_a_tree_is_written_alike_under_every_python():
