@@ -199,7 +199,7 @@ FIXED_SIZES = {
 
 MOST_SHARDS = 32
 """Largest number of shards of a voxel array, unless the store is very large. An update writes the
-last shard anew, and a reader keeps this number open."""
+last shard anew, and readers keep all of them open."""
 
 _CHUNKS_IN_SHARD = 64, 4_096
 """Least and largest number of chunks in a shard if parameters give none. With chunks of the usual

@@ -56,14 +56,16 @@ class StoredRecords:
         """Return the record of a row as its JSON, unchecked; StoreError if it cannot be read."""
         chunk, position = divmod(row, RECORDS_IN_CHUNK)
         # Callers ask for rows nearly in order, within each segment.
-        if chunk not in self._chunks:
+        kept = self._chunks.get(chunk)
+        if kept is None:
             start = chunk * RECORDS_IN_CHUNK
             stop = min(start + RECORDS_IN_CHUNK, len(self.store))
-            texts = self.store.read_rows(RECORD_ARRAY, start, stop)
-            if len(self._chunks) == _CHUNKS_KEPT:
-                del self._chunks[next(iter(self._chunks))]
-            self._chunks[chunk] = [str(text) for text in texts]
-        return self._chunks[chunk][position]
+            kept = [str(text) for text in self.store.read_rows(RECORD_ARRAY, start, stop)]
+            self._chunks[chunk] = kept
+            # Threads may share it, and add chunks at the same time.
+            for oldest in list(self._chunks)[:-_CHUNKS_KEPT]:
+                self._chunks.pop(oldest, None)
+        return kept[position]
 
 
 BUILD, ASSETS, SEVERAL, ERRORS = "build.json", "assets.jsonl", "assets-*.jsonl", "decoys.json"

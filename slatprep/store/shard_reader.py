@@ -8,7 +8,11 @@ adjacent, so this reader reads only them; zarr-python reads the same bytes with 
 
 from __future__ import annotations
 
+import errno
+import sys
 import threading
+import weakref
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -27,8 +31,11 @@ from slatprep.store.layout import MAX_RECORD_BYTES, RECORD_ARRAY
 MISSING = 2**64 - 1
 """Offset and length of a chunk that was never written: it holds the fill value."""
 
-OPEN_SHARDS = 32
-"""Largest number of open shards of one array."""
+OPEN_SHARDS = 512
+"""Largest number of open shards of a process, unless the system allows it few open files."""
+
+_OPENED: deque[tuple[weakref.ref[RowReader], int]] = deque()
+"""Reader and number of each shard that was opened, oldest first."""
 
 _COPIED_BYTES = 4 * 2**20
 
@@ -231,11 +238,19 @@ class RowReader:
                 return _Shard(None, np.full((self.chunks_per_shard, 2), MISSING, np.uint64))
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                raise StoreError(
+                    f"{self.folder.path}/{self.key(number)}: cannot be opened ({error.strerror}); "
+                    "raise the limit (ulimit -n), or close other files"
+                ) from None
             raise self._damaged(number, f"cannot be read ({error.strerror})") from None
         # Two threads may have opened the shard; either result may stay.
         self._shards[number] = shard
-        for oldest in list(self._shards)[:-OPEN_SHARDS]:
-            self._shards.pop(oldest, None)
+        _OPENED.append((weakref.ref(self), number))
+        while len(_OPENED) > _most_open():
+            of, oldest = _OPENED.popleft()
+            if reader := of():
+                reader._shards.pop(oldest, None)
         return shard
 
     def _index(self, number: int, file: RangeFile, size: int) -> NDArray[np.uint64]:
@@ -261,3 +276,13 @@ class RowReader:
 
 
 _KEYS = ({"name": "default"}, {"name": "default", "configuration": {"separator": "/"}})
+
+
+def _most_open() -> int:
+    """Return how many shards may stay open: half of what the process may open at most."""
+    if sys.platform == "win32":
+        return OPEN_SHARDS
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return OPEN_SHARDS if limit == resource.RLIM_INFINITY else min(OPEN_SHARDS, limit // 2)

@@ -71,8 +71,14 @@ class ShardWriter:
 
     def append_fill(self, rows: int) -> None:
         """Write a number of rows of the array's fill value."""
-        shape = (rows, *self._chunk.shape[1:])
-        self.append(np.full(shape, self._fill_value, self._chunk.dtype))
+        fill = np.full_like(self._chunk, self._fill_value)
+        first = min(rows, -self._rows % len(fill))  # These end a chunk that has been begun.
+        self.append(fill[:first])
+        whole, last = divmod(rows - first, len(fill))
+        data = self._encode(fill) if whole else b""
+        for _ in range(whole):
+            self.append_packed(data, [len(data)])
+        self.append(fill[:last])
 
     def append_packed(self, data: bytes, lengths: Iterable[int]) -> None:
         """Write the next chunks, already packed, as `RowReader.packed` yields them.

@@ -18,6 +18,7 @@ from slatprep.records import PIXIEVERSE, LatentSpace, Property
 from slatprep.storage.documents import adapter_of
 from slatprep.store import open_store
 from slatprep.store.attributes import RootAttributes, read_attributes, segments_of, width_findings
+from slatprep.store.layout import RECORDS_IN_CHUNK
 from slatprep.store.record import AssetRecord, BuildRecord, FailedRecord
 from slatprep.store.record_json import (
     FOLDER,
@@ -25,6 +26,7 @@ from slatprep.store.record_json import (
     read_record,
     to_json,
 )
+from slatprep.store.records import StoredRecords
 
 
 def lines_of(build: BuildSummary) -> list[bytes]:
@@ -51,6 +53,29 @@ def test_every_record_follows_the_published_schema(mixed_build):
     jsonschema.Draft202012Validator(published["build_record.schema.json"]).validate(build)
     assert build["id"] == mixed_build.build_id
     assert build["statuses"] == mixed_build.statuses
+
+
+def test_records_that_threads_read_at_once_are_not_kept_for_ever():
+    """A text that reads on while it is made stands for another thread at that moment."""
+
+    class Text(str):
+        def __str__(self) -> str:
+            row = int(self.removeprefix("row "))
+            if 6 * RECORDS_IN_CHUNK <= row < 20 * RECORDS_IN_CHUNK:
+                records.text(row + RECORDS_IN_CHUNK)
+            return str.__str__(self)
+
+    class Rows:
+        def __len__(self) -> int:
+            return 64 * RECORDS_IN_CHUNK
+
+        def read_rows(self, _: str, start: int, stop: int) -> list[Text]:
+            return [Text(f"row {row}") for row in range(start, stop)]
+
+    records = StoredRecords(Rows())
+    for chunk in range(64):
+        assert records.text(chunk * RECORDS_IN_CHUNK) == f"row {chunk * RECORDS_IN_CHUNK}"
+    assert len(records._chunks) == 8
 
 
 def test_the_published_schemas_are_those_of_the_classes():

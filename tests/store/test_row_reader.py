@@ -20,7 +20,7 @@ from slatprep.errors import StoreError
 from slatprep.parameters import MAX_SHARD_CHUNKS
 from slatprep.storage.files import LocalFile, LocalFolder
 from slatprep.store import shard_reader
-from slatprep.store.shard_reader import MAX_CHUNK_BYTES, OPEN_SHARDS, RowReader
+from slatprep.store.shard_reader import MAX_CHUNK_BYTES, DamagedFileError, RowReader
 
 NOT_THERE = 2**64 - 1
 
@@ -287,20 +287,49 @@ def test_chunks_that_lie_side_by_side_are_asked_for_at_once(tmp_path):
     assert asked(28, 36) == [span(1, 1, 1), span(1, 2, 2)]
 
 
-def test_the_shards_read_last_stay_open_and_no_others(tmp_path):
-    values = np.arange(1, OPEN_SHARDS + 9, dtype=np.uint8)
-    make(tmp_path, "voxel/material", values, 1, 1)
-    folder = WatchedFolder(tmp_path)
-    reader = reader_of(folder, "voxel/material")
+def test_the_shards_read_last_stay_open_and_no_others(tmp_path, monkeypatch):
+    """Of all stores of the process together."""
+    monkeypatch.setattr(shard_reader, "OPEN_SHARDS", 20)
+    values = np.arange(1, 17, dtype=np.uint8)
+    for name in "ab":
+        make(tmp_path / name, "voxel/material", values, 1, 1)
+    folders = [WatchedFolder(tmp_path / name) for name in "ab"]
+    readers = [reader_of(folder, "voxel/material") for folder in folders]
     for row in range(len(values)):
-        assert reader.read(row, row + 1).tolist() == [row + 1]
-    opened = len(folder.files)
-    assert opened == len(values)
-    assert sum(file() is not None for file in folder.files) == OPEN_SHARDS
-    reader.read(8, len(values))
-    assert len(folder.files) == opened
-    reader.read(7, 8)
-    assert len(folder.files) == opened + 1
+        for reader in readers:
+            assert reader.read(row, row + 1).tolist() == [row + 1]
+
+    def opened() -> int:
+        return sum(len(folder.files) for folder in folders)
+
+    files = [file for folder in folders for file in folder.files]
+    assert opened() == 32 and sum(file() is not None for file in files) == 20
+    for reader in readers:
+        reader.read(6, 16)
+    assert opened() == 32
+    readers[0].read(5, 6)
+    assert opened() == 33
+    del reader, readers
+    assert not any(file() for folder in folders for file in folder.files)
+
+
+def test_few_files_that_a_process_may_open_are_no_damage(tmp_path, monkeypatch):
+    make(tmp_path, "voxel/material", np.arange(1, 17, dtype=np.uint8), 1, 1)
+    reader = reader_of(tmp_path, "voxel/material")
+
+    def refusing(name: str) -> LocalFile:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(reader.folder, "open", refusing)
+    with pytest.raises(StoreError, match=r"c/0: cannot be opened .*; raise the limit") as caught:
+        reader.read(0, 1)
+    assert not isinstance(caught.value, DamagedFileError)
+    monkeypatch.undo()
+    resource = pytest.importorskip("resource")
+    with monkeypatch.context() as few:
+        few.setattr(resource, "getrlimit", lambda _: (16, 4096))
+        assert reader.read(0, 16).tolist() == [*range(1, 17)]
+    assert len(reader._shards) == 8
 
 
 @pytest.mark.parametrize("index_bytes", [0, 68], ids=["with the index", "behind the index"])

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import tracemalloc
 import warnings
 from itertools import pairwise
 from pathlib import Path
@@ -210,6 +211,17 @@ def test_rows_in_any_parts_make_the_shards_that_zarr_makes(store, tmp_path, name
         assert writer.written() == (len(content), hashlib.sha256(content).hexdigest())
     assert tree(ours / name) == tree(store / name)
     assert not list(tmp_path.rglob("*.partial/*"))
+
+
+def test_a_shard_of_fill_values_takes_no_memory_of_its_rows(tmp_path):
+    create_store(tmp_path / "s", 1, 2**22, StoreParameters(voxel_chunks_per_shard=1024))
+    with ShardWriter(tmp_path / "s", "voxel/valid", 0) as writer:
+        tracemalloc.start()
+        writer.append_fill(2**22)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < 2**20
+    assert not arrays_of(tmp_path / "s")["voxel/valid"][:].any()
 
 
 @pytest.mark.parametrize("name", ["voxel/feats", "voxel/coords", "voxel/valid"])
