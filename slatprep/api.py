@@ -41,7 +41,7 @@ def align_voxels(
         The SLAT side, in either form, on its own grid; a leading batch column of
         zeros, (N, 4), is dropped.
     parameters : AlignParameters, optional
-        Engine, model and scale bounds; the defaults of a build otherwise.
+        Engine, model and scale bounds; by default those of a build.
     resolution : int
         Voxels of the SLAT's grid along each axis.
 
@@ -111,7 +111,7 @@ def annotate_voxels(
         An alignment from `align_voxels`, used with its deformation; or a similarity
         from the PixieVerse frame to the SLAT frame.
     parameters : SampleParameters, optional
-        How far an annotation may be; the defaults of a build otherwise.
+        Largest distance of an annotation, and the method; by default those of a build.
     resolution : int
         Voxels of the SLAT's grid along each axis.
 
