@@ -1,6 +1,6 @@
-"""An object's annotations: aligned to the SLAT, looked up at its voxels, judged, and merged.
+"""Align an object's annotations to the SLAT, look them up at its voxels, judge and merge them.
 
-Where there are several, each is aligned by itself.
+If there are several, each is aligned by itself.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def annotate(
 ) -> Finished:
     """Align a field, look it up at the SLAT's voxels, and judge both.
 
-    An alignment or judgement that is known of the same field and SLAT stands.
+    A given `alignment` or `judgement` of the same field and SLAT is used as it is.
     """
     reused = alignment is not None
     if alignment is None:
@@ -60,7 +60,7 @@ def look_up(
     parameters: SampleParameters,
     judgement: Judgement | None = None,
 ) -> tuple[Annotation, Judgement]:
-    """Look a field up at the SLAT's voxels, and judge both; a judgement that is known stands."""
+    """Look a field up at the SLAT's voxels, and judge both, unless a judgement is given."""
     annotation = sample(field, map_of(alignment).to_pixieverse(latents.centres), parameters)
     if judgement is None:
         judgement, likely = judge(field, latents, alignment, annotation, parameters)
@@ -73,14 +73,14 @@ def look_up(
 def process_several(
     pair: AssetPair, parameters: BuildParameters, known: tuple[Contribution, ...] = ()
 ) -> Finished:
-    """Take an asset from several annotations of its object to one, merged.
+    """Merge several annotations of an asset's object into one.
 
-    Left out are those that cannot be used, and those whose alignment failed where that of another
-    did not. Of fields that occupy the same voxels one alignment serves all; what an earlier build
-    found, `known`, stands. Annotations that have a part of the properties alone, or no classes, add
-    to the others. Field, alignment, places and distances are those of the first that is merged and
-    has all that the store holds. InputError if there is none, or if the SLAT cannot be used, or if
-    a file was replaced between its hashing, which gives the asset its key, and its reading.
+    An annotation is left out if it cannot be used, or if its alignment failed and another did not.
+    Fields that occupy the same voxels share one alignment; results of an earlier build, `known`,
+    are used. An annotation with only some properties, or without classes, adds to the others.
+    Field, alignment, places and distances are those of the first merged annotation with all that
+    the store holds. InputError if there is none, if the SLAT cannot be used, or if a file was
+    replaced between its hashing, which gives the asset its key, and its reading.
     """
     sources, digests = hash_sources(pair)
     if len(sources) > MAX_SOURCES:
@@ -123,7 +123,7 @@ def _annotations(
     sources: tuple[SourceFile, ...],
     digests: Mapping[str, str],
 ) -> tuple[list[Finished], dict[str, InputError]]:
-    """Return each annotation that can be used, and why the others cannot."""
+    """Return the annotations that can be used, and the faults of the others by sample."""
     before = {one.sample: one for one in known}
     latents: StructuredLatents | None = None
     annotated: list[Finished] = []
@@ -155,7 +155,7 @@ def _annotations(
 
 
 def _in_order(field: MaterialField, pair: AssetPair) -> MaterialField:
-    """Return a field with the properties that it has in the order of the store's."""
+    """Return a field with its properties in the order of the store."""
     own = [one.name for one in field.table]
     columns = [own.index(p.name) for p in pair.roots.contents.properties if p.name in own]
     table = tuple(field.table[column] for column in columns)
@@ -185,7 +185,7 @@ def _replaced(one: AssetPair) -> InputError:
 
 
 def _same_alignment(field: MaterialField, annotated: list[Finished]) -> Alignment | None:
-    """Return the alignment of a field with the same geometry, which is all that engines use."""
+    """Return the alignment of a field with the same geometry, as engines use nothing else."""
     for one in annotated:
         frames = [own.frame is None or own.frame.tobytes() for own in (field, one.field)]
         if frames[0] == frames[1] and np.array_equal(field.occupancy, one.field.occupancy):
@@ -194,7 +194,7 @@ def _same_alignment(field: MaterialField, annotated: list[Finished]) -> Alignmen
 
 
 def _contribution(one: Finished, is_good: bool, sources: tuple[SourceFile, ...]) -> Contribution:
-    """Return what became of an annotation that can be used."""
+    """Return the contribution of an annotation that can be used."""
     left_out = "" if is_good else f"its alignment failed: {one.judgement.reasons[0]}"
     files = tuple(k for k, file in enumerate(sources) if file in one.field.sources)
     return Contribution(one.pair.sample, files, left_out, one.alignment, one.judgement)

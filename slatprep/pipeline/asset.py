@@ -1,10 +1,10 @@
-"""One asset: from its two source files to annotated SLAT voxels.
+"""Process one asset, from its two source files to annotated SLAT voxels.
 
-`process_asset` is the method, stage by stage. `finish_asset` is the task a
-worker gets: it does that, or uses what was done before, leaves the result in
-the spool and turns an asset's faults into its status. `compile_kernels` does all of it
-once before workers start: numba compiles a kernel when it is first called and keeps it on
-disk, and workers that start without it would each compile all of them, at the same time.
+`process_asset` runs the stages. `finish_asset` is the task of a worker: it
+runs the stages or uses earlier results, writes the result to the spool, and
+turns an asset's faults into its status. `compile_kernels` runs all stages once
+before workers start. Numba compiles a kernel at its first call and keeps it on disk; without that,
+each worker would compile all kernels, at the same time.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from slatprep.store.record import AssetRecord, FailedRecord, StatusOfFailed
 from slatprep.store.record_json import faults_of
 
 _REASON, _TRACEBACK = 4_000, 100_000
-"""Most letters of why an asset failed, and of where, which a stranger's names may be part of."""
+"""Largest lengths of a failure's reason and traceback, in which a stranger's names may be."""
 
 
 def process_asset(
@@ -64,8 +64,8 @@ def process_asset(
 ) -> Finished:
     """Take one asset from its two source files to annotated SLAT voxels, in SI units.
 
-    The alignment and judgement of `known` are taken over, an earlier build's record of the same
-    sources, parameters and code. InputError if a source cannot be used or a partner is missing.
+    `known` is an earlier build's record of the same sources, parameters and code; its alignment and
+    judgement are taken over. InputError if a source cannot be used or a partner is missing.
     """
     if pair.others:
         return process_several(pair, parameters, known.merged if known else ())
@@ -81,8 +81,8 @@ def finish_asset(
 ) -> Row | FailedRecord:
     """Bring one asset into the spool, with no more work than it needs; return its row.
 
-    `planned` is what was found of earlier work. StoreError if the disk does not take it; with
-    `strict`, the asset's own fault.
+    `planned` says which earlier work can be used. StoreError if the spool cannot be written; with
+    `strict`, the asset's own fault is raised.
     """
     reached("asset begun", pair.asset_id)
     if planned.action is Action.RESUME and (resumed := _resumed(planned, context.spool)):
@@ -104,14 +104,14 @@ def finish_asset(
         if context.strict:
             raise
         return record_of_failed(pair, context.recipe, *_why(error))
-    if planned.action is not Action.REUSE or planned.key != key:  # It changed since the plan.
+    if planned.action is not Action.REUSE or planned.key != key:  # Sources changed since the plan.
         damaged = ""
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
     return replace(kept, damaged=damaged, seen=as_read(pair, noted))
 
 
 def fail_asset(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> FailedRecord:
-    """Record as failed an asset that killed its worker twice, the second time alone in it."""
+    """Record as failed an asset that killed its worker twice, the second time alone."""
     reason = "its worker process was killed twice, probably because memory ran out"
     if context.strict:
         raise SlatprepError(f"{pair.asset_id}: {reason}")
@@ -119,7 +119,7 @@ def fail_asset(pair: AssetPair, planned: PlannedAsset, context: BuildContext) ->
 
 
 def _repeated(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> Finished | None:
-    """Return an asset as its record tells of it; None where there is none that still holds."""
+    """Return an asset made anew by its stored record; None if no record is still valid."""
     if context.previous is None or planned.action is not Action.REUSE:
         return None
     try:
@@ -139,7 +139,7 @@ def _key(asset: Finished, recipe: Recipe) -> str:
 
 
 def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
-    """Return what an interrupted build finished, under the names things have now."""
+    """Return the row of an asset that an interrupted build finished, with its current names."""
     found = spool.find(planned.key)
     if found and planned.names:
         spool.amend(replace(found[0], **planned.names))
@@ -148,7 +148,7 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
 
 
 def _why(error: Exception) -> tuple[str, str, StatusOfFailed]:
-    """Say why an asset cannot go in, in one line, where slatprep itself is at fault, and how."""
+    """Return a failure's reason in one line, the traceback of an internal error, the status."""
     line, trace = " ".join(str(error).split()), ""
     if len(line) > _REASON:
         line = f"{line[:_REASON]} ..."
@@ -166,11 +166,11 @@ WHEN = (
     if KEPT
     else "in each process, as no cache folder can be written to (NUMBA_CACHE_DIR names one)"
 )
-"""When kernels are compiled, for the user."""
+"""Words for the user on when kernels are compiled."""
 
 
 class _Watch(event.Listener):
-    """Starts a second process at the first kernel to be compiled, and tells of it."""
+    """Starts a second process when the first kernel has been compiled, and notes it."""
 
     def __init__(self, note: Callable[[str], None] | None) -> None:
         self.note = note
@@ -195,8 +195,8 @@ class _Watch(event.Listener):
 def compile_kernels(note: Callable[[str], None] | None = None) -> None:
     """Compile all kernels of alignment, sampling and judgement, and keep them on disk.
 
-    `note` gets a line where something has to be compiled, and one when that is done. Half of the
-    kernels are compiled by a second process. Where all are compiled already, this takes 1 s, once a
+    `note` is called with a line if a kernel must be compiled, and again at the end. A second
+    process compiles half of the kernels. If all are compiled already, this takes 1 s, once per
     process.
     """
     start, watch = time.monotonic(), _Watch(note)
@@ -209,7 +209,7 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
 
 
 def _bent_shape() -> tuple[MaterialField, StructuredLatents]:
-    """Return an L whose SLAT is bent so far that it is stretched, with a stray voxel."""
+    """Return an L-shaped field, and its SLAT, which is bent, stretched, and has a stray voxel."""
     occupied = np.zeros((RESOLUTION,) * 3, dtype=bool)
     occupied[20:44, 22:36, 26:34] = occupied[20:26, 22:36, 34:50] = True
     voxels = voxels_of(occupied)
@@ -219,13 +219,13 @@ def _bent_shape() -> tuple[MaterialField, StructuredLatents]:
     )
     bent = voxels.copy()
     bent[:, 2] += ((bent[:, 0] - 20) ** 2 // 25).astype(np.uint8)
-    bent = np.append(bent, np.zeros((1, 3), np.uint8), axis=0)  # far from all that is annotated
+    bent = np.append(bent, np.zeros((1, 3), np.uint8), axis=0)  # far from every annotated voxel
     return field, StructuredLatents(bent, np.zeros((len(bent), 8), np.float32))
 
 
 @cache
 def _process_a_bent_shape() -> None:
-    """Align, sample and judge, once a process."""
+    """Align, sample and judge the bent shape, once per process."""
     field, latents = _bent_shape()
     alignment = align(field, latents, AlignParameters(model="deformable"))
     places = map_of(alignment).places(latents.coords)
@@ -234,7 +234,7 @@ def _process_a_bent_shape() -> None:
 
 
 def _compile_others() -> None:
-    """Deform and sample without a search: its kernels take as long to compile as all others."""
+    """Deform and sample without a search, whose kernels take as long to compile as all others."""
     field, latents = _bent_shape()
     sides = surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy)
     parameters = AlignParameters(model="deformable")

@@ -1,9 +1,9 @@
-"""What is there before a build: a store, and sources that are as they were.
+"""What exists before a build: a store, and unchanged sources.
 
-Of a first build nothing is, and nobody needs this to understand one.
+A first build starts without them, and can be understood without this module.
 
-Sources are as they were by the state of their files. Of those, each build hashes a share all the
-same, drawn anew. Where one of them is another one, no state is trusted.
+A source counts as unchanged by the state of its files. Each build still hashes a share of the
+unchanged sources, drawn anew. If one of them has changed, no state is trusted.
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ from slatprep.store.records import BUILD, file_names
 from slatprep.workers.local import Jobs, run_unordered
 
 SHARE = 0.01
-"""Share of the sources whose state is as it was that a build hashes all the same."""
+"""Share of the sources with an unchanged state that a build hashes nevertheless."""
 
 
 @dataclass(eq=False)
 class Before:
-    """What is there before a build.
+    """What exists before a build.
 
     Attributes
     ----------
     place : Destination
-        Where the store lies, and its records.
+        Place of the store and its records.
     pairs : sequence of AssetPair
         The dataset.
     wanted : Wanted
-        What the build is asked for.
+        What is asked of the build.
     previous : SourceStore or None
-        The store that is there. Its files have been read once it is checked.
+        The existing store, of which `check` reads the files.
     known : mapping of str to (bytes, str)
         State and key of the assets whose sources are as the last build saw them.
     built : bool
-        Whether a build is known to have made the store, and not a choice among another's assets.
+        Whether a build is known to have made the store, not a subset or join of other stores.
     as_left : bool
         Whether the files of store and records are as the last build left them.
     damaged : tuple of str
-        What of the store is not as it was written.
+        Damaged parts of the store, in words.
     unnoticed : tuple of str
-        Ids of assets whose sources are other ones, though their states are as they were.
+        Ids of assets whose sources changed although their states did not.
     seed : int or None
-        What the assets were drawn with whose sources were hashed all the same; None if none was.
+        Seed of the draw of unchanged sources to hash; None if none was hashed.
     """
 
     place: Destination
@@ -84,14 +84,14 @@ class Before:
         return same and self.wanted.allows(self.previous)
 
     def holds(self, new: NextStore) -> bool:
-        """Whether the store that is there is sound, and the one that would be written."""
+        """Return whether the existing store is sound, and equals the one to be written."""
         return self.previous is not None and not self.damaged and new.same_as(self.previous)
 
     def standing_files(self, assets: int, taken: Collection[int] | None) -> set[str]:
-        """Return the files of lines that need not be looked at, of a store of so many assets.
+        """Return the files of lines that need not be checked, in a store of `assets` assets.
 
-        They are as the last build left them, and `taken` are the numbers of those whose shard of
-        records is the same; None where all are.
+        They are as the last build left them. `taken` has the numbers of files whose shard of
+        records is the same; None means all files.
         """
         if not self.as_left or self.damaged or self.previous is None:
             return set()
@@ -102,8 +102,8 @@ class Before:
     def check(self, jobs: Jobs) -> None:
         """Compare the records and columns of the store with their digests.
 
-        So are all other files, unless their states are as they were left, or they lie on an
-        object store, which keeps sums of its own.
+        All other files are compared too, unless they are as the last build left them, or they lie
+        on an object store, which keeps checksums of its own.
         """
         if self.previous is None:
             return
@@ -114,7 +114,7 @@ class Before:
             self.known = {}
 
     def note(self, store: Store, rows: Iterable[Row]) -> None:
-        """Write down what was seen of the sources of these rows of a store that is in place."""
+        """Write the states of the sources of these rows, for a store that is in place."""
         state = _store_state(self.place, self.place.manifests(store.path), len(store), wait=True)
         seen = {row.asset_id: row.seen for row in rows}
         states = [seen.get(asset_id, b"") for asset_id in store.ids]
@@ -122,7 +122,7 @@ class Before:
         write_seen(folder, bound, state, states, store.column("key"))
 
     def _bound_to(self, store: Store) -> bytes:
-        """Return what states hold for: this machine, a build's store, and how it was read."""
+        """Return a digest of this machine, a store and how sources are read: states hold for it."""
         wanted, also = self.wanted, self.wanted.parameters.also
         slat, held = wanted.parameters.slat, wanted.declared
         roots = (
@@ -136,11 +136,11 @@ class Before:
         try:
             assets, folder = len(previous), self.place.manifests()
             return any(state) and _store_state(self.place, folder, assets) == state
-        except StoreError:  # Damaged: how many rows there are is not known.
+        except StoreError:  # The store is damaged: its number of rows is not known.
             return False
 
     def _sample(self, share: float, seed: int | None, crew: Crew) -> None:
-        """Hash a share of the known sources; if one is not as it was, no sources are known."""
+        """Hash a share of the known sources; if one of them changed, forget all."""
         seed = time.time_ns() if seed is None else seed
         ids = sorted(self.known)
         drawn = set(random.Random(seed).sample(ids, math.ceil(share * len(ids))))
@@ -164,7 +164,7 @@ def look_back(
 ) -> Before:
     """Look at the sources, the store and what the last build saw; hash a share of the sources.
 
-    It is drawn by the clock if not by a seed. With `fresh` it is as if there were no store.
+    The share is drawn with `seed`, or by the clock. With `fresh`, an existing store is ignored.
     """
     before = Before(place, pairs, wanted)
     if fresh:
@@ -183,10 +183,10 @@ def look_back(
 
 
 def _store_state(place: Destination, manifests: Place, assets: int, wait: bool = False) -> bytes:
-    """Return the state of all files of a store of so many assets and of its records.
+    """Return the state of all files of a store of `assets` assets and of its records.
 
-    It is empty if not trusted. With `wait`, for a tenth of a second first, as they have just been
-    written.
+    It is empty if it cannot be trusted. With `wait`, wait a tenth of a second first, because the
+    files have just been written.
     """
     folder, store = storage_of(manifests).local, storage_of(place.store).local
     if folder is None or store is None:
@@ -209,13 +209,13 @@ def _store_state(place: Destination, manifests: Place, assets: int, wait: bool =
 
 
 def _seen_folder(place: Destination) -> Path:
-    """Return where it is kept what a build saw: with the records, if those are on the disk."""
+    """Return the folder for what a build saw: that of the records, if it is on a local disk."""
     folder = storage_of(place.manifests()).local
     return folder or storage_of(place.store).work_folder().parent
 
 
 def key_of(pair: AssetPair, recipe: Recipe) -> tuple[str, str]:
-    """Return an asset's id and the key that its sources give; empty if they cannot be read."""
+    """Return an asset's id and the key that its sources give, empty if they cannot be read."""
     try:
         return pair.asset_id, recipe.key(pair.asset_id, hash_sources(pair)[1])
     except SlatprepError:

@@ -1,7 +1,7 @@
-"""Build a store: every asset of a dataset, brought to one scale and packed.
+"""Build a store: normalise and pack every asset of a dataset.
 
-`slatprep.pipeline.asset` processes one asset; `build_store` runs it over a
-dataset, for what is new or changed, and replaces the store in one step. Its
+`slatprep.pipeline.asset` processes one asset; `build_store` runs it over the
+new and changed assets of a dataset, and replaces the store in one step. Its
 steps are: discover, look back, plan, finish, settle, pack, publish.
 """
 
@@ -57,7 +57,7 @@ __all__ = ["BuildPlan", "BuildSummary", "Progress", "align_pairs", "build_store"
 
 
 _BROUGHT_ABOUT = (OSError, ArithmeticError, ValueError, MemoryError, RuntimeError)
-"""Errors that data and machines bring about, and no fault of slatprep's own."""
+"""Errors that data and machines cause, unlike faults of slatprep itself."""
 
 
 def build_store(
@@ -77,15 +77,15 @@ def build_store(
     progress: Progress | None = None,
     note: Note | None = None,
 ) -> BuildSummary:
-    """Build a store of all assets of a dataset, or bring it up to date, with the records of how.
+    """Build a store of all assets of a dataset, or bring it up to date, with its records.
 
     Parameters
     ----------
     parameters : BuildParameters
         Sources and methods.
     out : str or Place
-        The store, a path or URL. An existing one is replaced, in one step, when the new
-        one is finished; assets that did not change are not aligned again.
+        The store, a path or URL. An existing store is replaced, in one step, when the new
+        store is finished; assets that did not change are not aligned again.
     manifests : str or Path, optional
         Directory of ``assets.jsonl`` and ``build.json``; by default beside the
         store, see `slatprep.store.records.manifests_of`.
@@ -95,38 +95,38 @@ def build_store(
     strict : bool
         Raise at the first asset that cannot be used instead of going on.
     fresh : bool
-        Do everything, whatever was done before.
+        Do everything anew, even if it was done before.
     keep_work : bool
         Keep each asset's arrays beside the store, about a megabyte an asset, so that
         the next build can pack all of them anew without reading their sources.
     rehash : float
-        Share of the sources to hash, drawn at random, of those whose files look as they were;
-        True, or 1, for all. Where one of them is another one, all are hashed.
+        Share of the sources to hash, drawn at random from those whose files look unchanged;
+        True, or 1, for all. If one of them has changed, all are hashed.
     rehash_seed : int, optional
-        What that share is drawn with; by default the clock. It stands in the summary.
+        Seed of that draw; by default the clock. The summary has it.
     compact : bool
-        Order rows by id, as in a first build, where updates have added some behind.
+        Order rows by id, as in a first build, even if updates have added rows at the end.
     decoys : int
-        Measure errors on at most so many decoys, see `slatprep.pipeline.decoys`; 0: none. What
-        they say lies beside the store, whose bytes do not depend on it.
+        Largest number of decoys for measuring errors, see `slatprep.pipeline.decoys`; 0 for none.
+        The result lies beside the store, whose bytes do not depend on it.
     assets_per_job : int
-        Start no more processes than there are so many assets for.
+        Least number of assets for each process that is started.
     progress : callable, optional
         See `Progress`.
     note : callable, optional
-        Gets lines for the user, such as what takes long before the first asset.
+        Called with lines for the user, such as on long work before the first asset.
 
     Returns
     -------
     BuildSummary
-        What went in and what did not.
+        Summary of the assets that went in, and of those that did not.
 
     Raises
     ------
     ConfigError
-        If `out` is something other than a store, or a parameter makes no sense.
+        If `out` is something other than a store, or a parameter is invalid.
     StoreError
-        If another build is writing it, no asset can be used, or the disk does not take what is
+        If another build is writing the store, no asset can be used, or the store cannot be
         written.
     InputError
         With `strict`, for the first asset that cannot be used.
@@ -168,7 +168,7 @@ def build_store(
             try:
                 measure_build(place.in_place(), aligned, decoys, crew, before.previous)
             except (*_BROUGHT_ABOUT, SlatprepError) as error:
-                # The store is published, and stays so.
+                # The store is published already, and stays.
                 told = f"errors were not measured ({error}); run `slatprep measure-errors`"
                 summary = replace(summary, warnings=(*summary.warnings, told))
     return summary
@@ -181,7 +181,7 @@ def _finish_all(
     crew: Crew,
     before: Before | None,
 ) -> list[Row | FailedRecord]:
-    """Return all assets: those of the store that is there as rows of it, where they may stay."""
+    """Return all assets; unchanged ones stay rows of the existing store if that is possible."""
     reused = [pair for pair in pairs if plan[pair.asset_id].action is Action.REUSE]
     others = [pair for pair in pairs if plan[pair.asset_id].action is not Action.REUSE]
     made = finish(others, plan, context, crew)
@@ -192,13 +192,13 @@ def _finish_all(
 def finish(
     pairs: Sequence[AssetPair], plan: Mapping[str, PlannedAsset], context: BuildContext, crew: Crew
 ) -> list[Row | FailedRecord]:
-    """Bring assets into the spool; return what is kept of each, in no order.
+    """Bring assets into the spool; return the row or failure of each, in no order.
 
-    `plan` says what is to be done by id.
+    `plan` has the planned action of each asset by id.
     """
     if not pairs:
         return []
-    # Late: a run that finds nothing changed needs neither numba nor scipy.
+    # Imported late: a run without changes needs neither numba nor scipy.
     from slatprep.pipeline.asset import compile_kernels, fail_asset, finish_asset
 
     jobs = crew.of(len(pairs))
@@ -206,7 +206,7 @@ def finish(
     if isinstance(jobs, int) and read:
         start_early(finish_asset, jobs)
         fetch_members(read, crew.note)
-        compile_kernels(crew.note)  # Before workers of this machine work, each to compile all.
+        compile_kernels(crew.note)  # Otherwise each worker of this machine compiles all of them.
     tasks = ((pair, plan[pair.asset_id], context) for pair in pairs)
     assets: list[Row | FailedRecord] = []
     if crew.progress:
@@ -228,7 +228,7 @@ def plan_build(
     rehash: bool = False,
     progress: Progress | None = None,
 ) -> BuildPlan:
-    """Say what `build_store` would do with each asset, and why; nothing is written."""
+    """Return what `build_store` would do with each asset, and why; write nothing."""
     parameters = checked(BuildParameters, parameters)
     place, wanted = Destination(out, manifests), Wanted.of(parameters)
     crew = Crew(jobs, progress=progress)
@@ -259,10 +259,10 @@ def align_pairs(
 ) -> BuildSummary:
     """Align all assets of a dataset and write their records, without a store.
 
-    `out` is a JSON Lines file in the form of a build's ``assets.jsonl``, sorted by asset id, with
-    the assets that cannot be used too. Other parameters are as for `build_store`. InputError with
-    `strict`, for the first asset that cannot be used; ConfigError if `out` lies in a store, or is a
-    file of something else than records.
+    `out` is a JSON Lines file in the form of a build's ``assets.jsonl``, sorted by asset id; it
+    includes assets that cannot be used. Other parameters are as for `build_store`. InputError with
+    `strict`, for the first asset that cannot be used. ConfigError if `out` lies in a store, or is
+    a file without records.
     """
     begin = time.perf_counter()
     parameters = checked(BuildParameters, parameters)
@@ -296,7 +296,7 @@ def align_pairs(
 def _discover(
     parameters: BuildParameters, jobs: Jobs, *shared: Place, note: Note | None = None
 ) -> list[AssetPair]:
-    """Return the pairs; see that the workers find the first one's files, and `shared`."""
+    """Return the pairs; check that the workers see the first pair's files, and `shared`."""
     pairs = discover(parameters, note)
     check_objects(pairs, parameters.normalize)
     sources = next(([pair.grid, pair.slat] for pair in pairs if pair.grid and pair.slat), [])
@@ -311,9 +311,9 @@ def _publish(
     records: frozenset[int] | None = None,
     failed: Sequence[FailedRecord] = (),
 ) -> BuildSummary:
-    """Publish the store that is in place, or was there, with its manifests; note what was seen.
+    """Publish the new or unchanged store with its manifests; note the states of sources.
 
-    `records` are the shards of records that were taken over; None where nothing was written.
+    `records` are the shards of records that were taken over; None if no store was written.
     """
     place, previous = before.place, before.previous
     store = place.in_place() if previous is None or records is not None else previous

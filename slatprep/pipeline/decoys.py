@@ -1,8 +1,8 @@
-"""How many of a store's alignments show another object, measured on decoys of the dataset itself.
+"""Measure how many of a store's alignments show another object, on decoys of its own dataset.
 
-A decoy is an asset's grid aligned with the SLAT of another object, of the size nearest to its
-own. Which grids are drawn depends on a seed and the ids alone, so those of an update are
-mostly those of before, and what was measured of them is taken over.
+A decoy is an asset's grid aligned with the SLAT of another object that is nearest in size. The
+draw of grids depends only on a seed and the ids. So an update draws mostly the same decoys as
+before, and takes over what was measured on them.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, run_unordered
 
 DECOYS = 200
-"""Decoys of a dataset, at most one for each asset."""
+"""Number of decoys of a dataset, which has at most one for each asset."""
 
 EVERY = 20
-"""A build aligns one decoy for each so many assets that it aligns: 5 % more."""
+"""Number of assets that a build aligns for each decoy that it aligns: 5 % more work."""
 
 ALIKE = 0.2
-"""From this share of decoys called good on, objects are too much alike for decoys to tell."""
+"""Share of decoys called good from which objects are too much alike for decoys to tell."""
 
 RATES = (0.001, 0.01, 0.05)
-"""Shares of wrong assets for which it is said how many assets may be kept."""
+"""Shares of wrong assets for which the number of assets that may be kept is computed."""
 
 LEAST_TOLD = 0.001
 """Least probability of an error that is kept for an asset."""
 
 _TAKEN_OVER = ("refitted", "wrong_share", "wrong_share_range", "good", "good_wrong",
                "good_wrong_range")  # fmt: skip
-"""What is kept as `slatprep.judge.decoys.ErrorRates` has it."""
+"""Fields that are copied from `slatprep.judge.decoys.ErrorRates`."""
 
 BINS = 40
 _MAX_BYTES = 64 * 2**20
@@ -58,11 +58,11 @@ _MAX_BYTES = 64 * 2**20
 
 @dataclass(frozen=True)
 class Decoy:
-    """An asset's grid with another one's SLAT, both by their ids.
+    """An asset's grid and another asset's SLAT, both by their ids.
 
-    `keys` say what these two were made from and how. `verdict` is what the alignment is called, as
-    that of an asset would be. `evidence` has its `slatprep.judge.evidence.FIGURES`, empty before it
-    is aligned.
+    `keys` are the keys of the two assets. `verdict` is that on the decoy's alignment, as for an
+    asset. `evidence` has the alignment's `slatprep.judge.evidence.FIGURES`; it is empty before the
+    decoy is aligned.
     """
 
     grid: str
@@ -74,7 +74,7 @@ class Decoy:
 
 @dataclass(frozen=True)
 class Kept:
-    """How many assets may be kept at a share of wrong ones, and the least score that they have."""
+    """Number of assets that may be kept at a share of wrong assets, and their least score."""
 
     rate: float
     assets: int
@@ -83,35 +83,35 @@ class Kept:
 
 @dataclass(frozen=True)
 class MeasuredErrors:
-    """The errors of a store's alignments, as `ERRORS` keeps them.
+    """The errors of a store's alignments, as the file `ERRORS` keeps them.
 
     Attributes
     ----------
     build : str
         Id of the build that was measured.
     seed : int
-        Of the draw of decoys.
+        Seed of the draw of decoys.
     assets : int
-        How many the store had.
+        Number of assets that the store had.
     refitted : bool
-        Whether the score was learned on the dataset; else it is the shipped model's.
+        Whether the score was learned on the dataset; else the shipped model gives it.
     wrong_share : float
         Share of all assets that show another object.
     good : int
-        Assets called good.
+        Number of assets called good.
     good_wrong : float
-        How many of them show another object.
+        Number of assets called good that show another object.
     wrong_share_range, good_wrong_range : tuple of float
-        Where these two lie with a probability of 0.95.
+        Intervals that have these two with a probability of 0.95.
     kept : tuple of Kept
-        For each of `RATES`.
+        Assets that may be kept, for each of `RATES`.
     errors : dict of str to float
-        Posterior probability that an asset shows another object, by id; those of `LEAST_TOLD`
-        and more.
+        Posterior probability that an asset shows another object, by id, if it is at least
+        `LEAST_TOLD`.
     edges, targets, counts : tuple
-        Histogram of the scores, logarithms of odds: edges, assets and decoys in between.
+        Histogram of the scores (logarithms of odds): edges, and assets and decoys in between.
     decoys : tuple of Decoy
-        What it was measured on.
+        The decoys on which the errors were measured.
     """
 
     build: str
@@ -132,7 +132,7 @@ class MeasuredErrors:
 
     @property
     def passed(self) -> int:
-        """Decoys called good."""
+        """Number of decoys called good."""
         return sum(one.verdict == Verdict.GOOD for one in self.decoys)
 
     @property
@@ -142,7 +142,7 @@ class MeasuredErrors:
 
     @property
     def tells(self) -> bool:
-        """Whether decoys tell how many show another object, and which: there are enough."""
+        """Whether decoys tell how many assets, and which, show another object."""
         return self.refitted and not self.alike
 
     def sentences(self) -> list[str]:
@@ -170,7 +170,7 @@ class MeasuredErrors:
         ]
 
     def of_asset(self, asset_id: str) -> str:
-        """Say how probable it is that an asset shows another object; only where this `tells`."""
+        """Say how probable it is that an asset shows another object; valid only if this `tells`."""
         error = self.errors.get(asset_id)
         likely = f"below {LEAST_TOLD:.1%}" if error is None else f"{error:.1%}"
         return f"by the decoys of its dataset, the probability of another object is {likely}"
@@ -186,29 +186,29 @@ def measure_errors(
     most_new: int | None = None,
     before: MeasuredErrors | None = None,
 ) -> MeasuredErrors:
-    """Count the errors of a store's alignments on decoys; none of its assets is aligned again.
+    """Measure the errors of a store's alignments on decoys, without aligning its assets again.
 
     Parameters
     ----------
     store : Store
         An aligned dataset.
     decoys : int
-        How many decoys at most.
+        Largest number of decoys.
     seed : int
-        Of their draw.
+        Seed of their draw.
     jobs : int or Workers
         Worker processes; the result does not depend on it.
     progress : callable, optional
-        Called with the decoys done and the decoys to align.
+        Called with the number of decoys done, and of decoys to align.
     most_new : int, optional
-        How many decoys to align at most; the others are those that were aligned before.
+        Largest number of decoys to align; the others were aligned before.
     before : MeasuredErrors, optional
-        Whose decoys are taken over; by default what was measured of this store.
+        Measurement whose decoys are taken over; by default the last one of this store.
 
     Returns
     -------
     MeasuredErrors
-        Also written to `file_of` the store.
+        The result, which is also written to `file_of` the store.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def measure_errors(
         If the store has fewer than two objects, its transforms were given, or its records have
         no evidence.
     SlatprepError
-        If a decoy kills its worker even alone.
+        If a decoy kills its worker again when it runs alone.
     """
     from slatprep.judge.decoys import error_rates
 
@@ -272,11 +272,11 @@ def measure_errors(
 def measure_build(
     store: Store, aligned: int, most: int, crew: Crew, before: SourceStore | None
 ) -> None:
-    """Measure the errors of a store that a build has just written, within `EVERY`.
+    """Measure the errors of a store that a build has just written, within the limit of `EVERY`.
 
-    `aligned` is how many assets it aligned, `most` how many decoys there may be, and `before` the
-    store that it replaces. Where these allow no decoy, what was measured before stands, and
-    `told_of` says that it is of before.
+    `aligned` is the number of assets that the build aligned, `most` the largest number of decoys,
+    and `before` the store that was replaced. If no decoy is allowed, the earlier measurement stays,
+    and `told_of` says that it is an earlier one.
     """
     measured = measured_errors(store.path) or (measured_errors(before.path) if before else None)
     new = min(aligned // EVERY, most)
@@ -285,14 +285,14 @@ def measure_build(
             _write(store, measured)
         return
     crew.tell(f"measuring errors on at most {new:,} new decoys")
-    # As many as were asked for by hand are kept.
+    # A person may have asked for more decoys before; their number is kept.
     count = max(min(len(store) // EVERY, most), len(measured.decoys) if measured else 0)
     seed, jobs = measured.seed if measured else 0, crew.of(aligned // EVERY)
     measure_errors(store, count, seed, jobs, most_new=new, before=measured)
 
 
 def _no_decoys(store: Store) -> str:
-    """Say why a store can have no decoys; empty where it can."""
+    """Say why a store can have no decoys; empty if it can."""
     if len(set(map(str, store.column("object_id")))) < 2:
         return "decoys need at least two objects, and it has one"
     if str(Engine.KNOWN) in store.column("engine"):
@@ -301,13 +301,13 @@ def _no_decoys(store: Store) -> str:
 
 
 def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.float64]]:
-    """Return from the records: keys by id, digests of grids by row, the evidence (A, F)."""
+    """Read the records' keys by id, digests of grids by row, and evidence (A, F)."""
     records = StoredRecords(store)
     keys: dict[str, str] = {}
     grids: list[str] = []
     evidence: list[NDArray[np.float64]] = []
     for row, asset_id in enumerate(store.ids):
-        # To check a whole record takes a millisecond, and only these are needed.
+        # Checking a whole record takes a millisecond, and only these entries are needed.
         try:
             record = orjson.loads(records.text(row))
             keys[asset_id] = str(record["key"])
@@ -326,15 +326,15 @@ def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.fl
 def draw_decoys(
     store: Store, keys: Mapping[str, str], grids: Sequence[str], count: int, seed: int
 ) -> list[Decoy]:
-    """Choose grids by a hash of their ids, and for each the SLAT of the size nearest to its own.
+    """Draw grids by a hash of their ids, and for each another object's SLAT of the nearest size.
 
-    It is another object's: neither its own SLAT, nor one whose grid is the same file, by the
-    digests of `grids`, where they are known.
+    The SLAT differs in content from the grid's own. Its asset's grid is another file, by the
+    digests of `grids`, if they are known.
     """
     ids, objects = store.ids, [str(one) for one in store.column("object_id")]
     sizes = np.diff(store.offsets).tolist()
     by_hash = sorted(range(len(ids)), key=lambda row: _hash(seed, ids[row]))
-    # Stable, so that of one size the order is that of the hashes.
+    # The sort is stable, so assets of equal size are in the order of their hashes.
     by_size = sorted(by_hash, key=sizes.__getitem__)
     place = {row: at for at, row in enumerate(by_size)}
     contents: list[Sequence[object]] = [objects, slat_contents(store), grids]
@@ -360,7 +360,7 @@ def _hash(seed: int, text: str) -> bytes:
 
 
 def fold_of(object_id: str) -> int:
-    """Return the part of the objects that one belongs to, whatever others there are."""
+    """Return the fold of an object, which does not depend on other objects."""
     from slatprep.judge.decoys import FOLDS
 
     return hashlib.sha256(f"fold {object_id}".encode()).digest()[0] % FOLDS
@@ -369,7 +369,7 @@ def fold_of(object_id: str) -> int:
 def align_decoy(
     path: Place, number: int, decoy: Decoy, parameters: StageParameters
 ) -> tuple[int, Decoy]:
-    """Align a decoy as its grid was; return it, judged, with its number."""
+    """Align and judge a decoy with the parameters of its grid; return it with its number."""
     from slatprep.align import align
     from slatprep.pipeline.annotate import look_up
 
@@ -383,7 +383,7 @@ def align_decoy(
 def fail_decoy(
     path: Place, number: int, decoy: Decoy, parameters: StageParameters
 ) -> tuple[int, Decoy]:
-    """Raise for a decoy that killed its worker twice, the second time alone in it."""
+    """Raise for a decoy that killed its worker twice, the second time when it ran alone."""
     raise SlatprepError(
         f"{path}: the decoy of {decoy.grid} with the SLAT of {decoy.slat} killed its worker "
         "process twice, probably because memory ran out"
@@ -391,7 +391,7 @@ def fail_decoy(
 
 
 def file_of(store: Place) -> Place:
-    """Return where a store's errors are kept; ``demo`` and ``demo.zarr`` have one folder."""
+    """Return the file of a store's errors; ``demo`` and ``demo.zarr`` share a folder."""
     local = storage_of(store).local
     name = "" if local is None else local.resolve().name
     own = name and not name.endswith(".zarr")
@@ -399,16 +399,16 @@ def file_of(store: Place) -> Place:
 
 
 def measured_errors(store: Place) -> MeasuredErrors | None:
-    """Return what was measured of a store, or of what it was before an update; None if nothing."""
+    """Return the last measurement of a store, perhaps from before an update; None if none."""
     try:
         text = read_bounded(file_of(store), _MAX_BYTES)
         return read_as(MeasuredErrors, text)
     except (OSError, ValueError):
-        return None  # They are measured anew.
+        return None  # The errors are measured anew.
 
 
 def told_of(store: Store) -> list[str]:
-    """Return what is known of a store's errors in sentences, or why nothing is known."""
+    """Return sentences on what is known of a store's errors, or on why nothing is known."""
     measured = measured_errors(store.path)
     if measured is None:
         if reason := _no_decoys(store):
@@ -426,7 +426,7 @@ def told_of(store: Store) -> list[str]:
 
 
 def writable_file(store: Place) -> Place:
-    """Return `file_of` a store; raise SlatprepError if what lies there is of other origin."""
+    """Return `file_of` a store; raise SlatprepError if a file of other origin is there."""
     file = file_of(store)
     local = storage_of(file).local
     if local is not None:
@@ -437,7 +437,7 @@ def writable_file(store: Place) -> Place:
 
 
 def _write(store: Store, measured: MeasuredErrors) -> None:
-    """Write what was measured beside the store."""
+    """Write a measurement beside the store."""
     file = writable_file(store.path)
     with writing(str(file), file.parent), storage_of(file).staged() as path:
         path.write_bytes(orjson.dumps(measured, option=orjson.OPT_INDENT_2) + b"\n")

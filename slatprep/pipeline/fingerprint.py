@@ -1,9 +1,10 @@
 """A fingerprint of the code that makes an asset's numbers.
 
 Work done by other code must be done again, but a new command, a new comment
-or a new release must not cost a day of alignment. So the fingerprint is of
-the statements, without comments, docstrings and layout, of the modules that
-the stages read, align, sample and judge can reach, and of nothing else.
+or a new release must not cost a day of alignment. So the fingerprint covers
+only the modules that the stages read, align, sample and judge can reach. It
+covers their statements, without comments, layout, and the docstrings of
+modules, classes and functions; the text below a constant counts.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ STAGES = (
     "slatprep.judge",
     "slatprep.pipeline.annotate",
 )
-"""Where an asset's numbers are made; a package stands for all of its modules."""
+"""Modules that make an asset's numbers; a package stands for all of its modules."""
 
-# Parameters enter an asset's key as values, so their defaults may change; the
-# words of an error are no numbers; a record holds numbers and makes none; and of
-# slatprep itself it is only the version.
+# These make no numbers. Parameters enter an asset's key as values, so their
+# defaults may change. Errors are words, and a record only holds numbers. The
+# package itself has only the version.
 _NOT_NUMBERS = (
     "slatprep",
     "slatprep.errors",
@@ -36,8 +37,8 @@ _NOT_NUMBERS = (
     "slatprep.workers.local",
 )
 
-# Whichever way bytes come from a disk or a network, their digest tells them; but
-# these make values of them.
+# Digests identify bytes, however these come from a disk or a network. But these
+# modules make values from bytes.
 _DECODING = ("slatprep.storage.chunks",)
 
 PACKING = (
@@ -54,14 +55,14 @@ PACKING = (
     "slatprep.store.shard_writer",
     "slatprep.store.writer",
 )
-"""What makes ranges, settles ties, and packs rows, columns and records; these modules alone."""
+"""Modules that make ranges, settle ties, and pack rows and records; their imports do not count."""
 
 
 @lru_cache(maxsize=1)
 def packing_fingerprint() -> str:
     """Return the beginning of the SHA-256, in hex, of the statements of `PACKING`.
 
-    Rows that other code packed are packed anew, but their assets are not aligned again.
+    Rows that were packed by other code are packed anew, but their assets are not aligned again.
     """
     return _digest_of(map(_module, PACKING))[:16]
 
@@ -91,7 +92,7 @@ def numeric_modules() -> dict[str, Path]:
     while waiting:
         name = waiting.pop()
         carries = name.startswith("slatprep.storage") and name not in _DECODING
-        # What is no module is a name inside one, as `from slatprep.records import Verdict` has.
+        # A name that is no module is defined in one, as in `from slatprep.records import Verdict`.
         path = _module(name) if name in STAGES else _source(name)
         if name in found or name in _NOT_NUMBERS or carries or path is None:
             continue
@@ -110,7 +111,7 @@ def _module(name: str) -> Path:
 
 
 def _source(name: str) -> Path | None:
-    # Not by importlib, which would import, and compile, what a name is looked for in.
+    # Not by importlib, which would import and compile the package of the name.
     place = Path(__file__).parents[1].joinpath(*name.split(".")[1:])
     files = (place.with_name(f"{place.name}.py"), place / "__init__.py")
     return next((file for file in files if file.is_file()), None)
@@ -118,7 +119,7 @@ def _source(name: str) -> Path | None:
 
 @lru_cache(maxsize=256)
 def _parsed(text: bytes) -> ast.Module:
-    """Return a module without its docstrings, which is asked for twice."""
+    """Return a module without docstrings; the cache serves the second call."""
     tree = ast.parse(text)
     for node in _statements(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
@@ -141,15 +142,15 @@ def _statements(node: ast.AST) -> Iterator[ast.AST]:
     """Yield a node and every statement in it, in less time than `ast.walk` takes."""
     yield node
     for child in ast.iter_child_nodes(node):
-        if not isinstance(child, ast.expr):  # which holds no statement
+        if not isinstance(child, ast.expr):  # An expression holds no statement.
             yield from _statements(child)
 
 
 def _dump(node: object) -> str:
     """Write a tree as `ast.dump` does, but alike under every Python.
 
-    Newer ones have more fields, empty where older code could not use them,
-    and leave out others that are empty; so all of those are left out here.
+    Newer versions have more fields, which are empty for older syntax, and leave
+    out some empty fields. So all empty fields are left out here.
     """
     if isinstance(node, ast.AST):
         values = [(name, getattr(node, name, None)) for name in node._fields]
@@ -157,4 +158,4 @@ def _dump(node: object) -> str:
         return f"{type(node).__name__}({', '.join(fields)})"
     if isinstance(node, list):
         return f"[{', '.join([_dump(one) for one in node])}]"
-    return ascii(node)  # repr() shows what this Python's edition of Unicode calls printable
+    return ascii(node)  # repr() depends on the version of Unicode in this Python.

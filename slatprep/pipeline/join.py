@@ -1,8 +1,8 @@
-"""Stores made of stores: some assets of one, or those of several, without aligning again.
+"""Make a store from stores, a subset of one or a join of several, without aligning again.
 
 Rows and records are taken over as they are. Ranges stay too, so a subset keeps
-the ranges of the dataset that it was chosen from; only stores that each have
-ranges of their own dataset are brought to the ranges of all of them.
+the ranges of the dataset from which it was chosen. Only joined stores that each
+have the ranges of their own dataset are converted to common ranges.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NO_ROOT, APART = "unknown", " | "
 """The root that a build's record gives for unknown sources, and what separates several roots."""
 
 _ROWS_A_JOB = 256
-"""No more processes are started than there are so many rows for."""
+"""Least number of rows for each process that is started."""
 
 
 def subset_store(
@@ -49,7 +49,7 @@ def subset_store(
     jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> BuildSummary:
-    """Make a store of some assets of another.
+    """Make a store of some assets of another store.
 
     Its bytes are those of a build of the same assets with the same given ranges.
 
@@ -60,13 +60,13 @@ def subset_store(
     out : str or Place
         The new store, a path or URL; an existing one is replaced in one step.
     assets : str, or iterable of str or int
-        Ids, beginnings of ids that no other has, or numbers; see `Store.match`.
+        Ids, unique beginnings of ids, or numbers; see `Store.match`.
     manifests : str or Path, optional
         Folder of its records; by default beside it.
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`.
     progress : callable, optional
-        Called with the shards written and those there are.
+        Called with the number of shards written, and of all shards.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def subset_store(
     ConfigError
         If no asset is named, or `out` is the store itself.
     StoreError
-        If the store lacks an asset, or cannot be read, or the disk does not take the new one.
+        If the store lacks an asset, or cannot be read, or the new store cannot be written.
     """
     source = _source(store)
     everything = _rows([source])
@@ -99,11 +99,11 @@ def concat_stores(
     jobs: Jobs = 1,
     progress: Progress | None = None,
 ) -> BuildSummary:
-    """Make one store of the assets of several.
+    """Make one store of the assets of several stores.
 
-    Stores with the same ranges are joined byte by byte. Where each has those
-    of its own dataset, properties are brought to the ranges that span all of
-    them, by way of SI units in float32: right to 1e-6 of a range.
+    Stores with the same ranges are joined byte by byte. If each store has the
+    ranges of its own dataset, properties are converted to ranges that span all
+    of them, through SI units in float32, with errors up to 1e-6 of a range.
 
     Parameters
     ----------
@@ -120,11 +120,11 @@ def concat_stores(
     Raises
     ------
     ConfigError
-        If there are fewer than two, or they do not go together: an id is in two
-        of them, parameters of alignment or look-up differ, or ranges differ
-        that do not come from the datasets.
+        If there are fewer than two, or they do not fit together: an id is in two
+        of them, parameters of alignment or lookup differ, or ranges differ and
+        do not come from the datasets.
     StoreError
-        If one cannot be read, or the disk does not take the new one.
+        If a store cannot be read, or the new store cannot be written.
     """
     sources = [_source(store) for store in stores]
     if len(sources) < 2:
@@ -145,7 +145,7 @@ def concat_stores(
 
 
 def _source(store: Store | str | Place) -> SourceStore:
-    # Anew, as workers do: what an open store has read may be of one that was replaced since.
+    # Opened anew, as workers do: an open store may hold data of a store that was replaced since.
     return SourceStore(open_store(open_store(store).path))
 
 
@@ -167,7 +167,7 @@ def _write(
     jobs: Jobs,
     progress: Progress | None,
 ) -> BuildSummary:
-    """Write a store of rows of others."""
+    """Write a store from rows of other stores."""
     begin = time.perf_counter()
     for source in new.stores:
         if _same_place(source.path, place.store):
@@ -179,7 +179,7 @@ def _write(
 
 
 def _require_unclipped(new: NextStore) -> None:
-    """Raise StoreError where a row is to be brought to ranges, and lost values to its own."""
+    """Raise StoreError if a row needs other ranges, but lost values to its own ranges."""
     clipped = (new.column("clipped") + new.column("clipped_grid")).any(axis=1)
     for row, lost in zip(new.rows, clipped, strict=True):
         source = new.stores[row.store]
@@ -191,14 +191,14 @@ def _require_unclipped(new: NextStore) -> None:
 
 
 def _same_place(one: Place, other: Place) -> bool:
-    """Whether a store or a version of it lies at another place, whatever leads there."""
+    """Return whether a store, or a version of it, lies at another place, also through links."""
     a, b = storage_of(one).local, storage_of(other).local
     one = one.parent.parent if is_version(one) else one
     return one == other if a is None or b is None else a.resolve() == b.resolve()
 
 
 def _places_of_sources(store: SourceStore) -> dict[str, Any]:
-    """Return where a store's sources lay; nothing where no record beside it is of its build."""
+    """Return the places of a store's sources; empty if no record beside it is of its build."""
     folder = found_manifests(store.path, store.about.manifest)
     with suppress(StoreError):  # The store does not need it, and `slatprep verify` names it.
         record = folder and build_in(folder)
@@ -210,7 +210,7 @@ def _places_of_sources(store: SourceStore) -> dict[str, Any]:
 
 
 def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildParameters:
-    """Return what the build's record says: the parameters, and where all sources lay."""
+    """Return the parameters for the build's record, with the places of all sources."""
     places: dict[str, Any] = {"pixieverse": {"root": NO_ROOT}, "slat": {"root": NO_ROOT}}
     named = [_places_of_sources(source) for source in sources]
     if all(own == named[0] for own in named):
@@ -230,7 +230,7 @@ def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildP
 
 
 def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:
-    """Return the attribute ``build`` of the joined store; versions that differ are all named."""
+    """Return the attribute ``build`` of the joined store, with all versions that differ."""
     first = sources[0]
     for other in sources[1:]:
         both = first.build["parameters"], other.build["parameters"]
@@ -253,7 +253,7 @@ def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:
 
 
 def _common_ranges(sources: Sequence[SourceStore]) -> Normalization:
-    """Return the ranges that all have, or those that span all datasets'."""
+    """Return the ranges that all stores have, or ranges that span those of all datasets."""
     ranges = [source.normalization for source in sources]
     if all(one == ranges[0] for one in ranges):
         return ranges[0]
@@ -276,7 +276,7 @@ def _in_words(space: LatentSpace) -> str:
 
 
 def _common_contents(sources: Sequence[SourceStore], rows: Sequence[Row]) -> Contents:
-    """Return what all stores hold; moments of latents that a build measured are pooled."""
+    """Return the contents of all stores; pool the moments of latents that builds measured."""
     first = sources[0].contents
     for source in sources[1:]:
         other = source.contents

@@ -1,4 +1,4 @@
-"""What the rows of a build tell: their counts, and what a person should know of the dataset."""
+"""Notices on a dataset that a person should know, from the rows of a build."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from slatprep.records import AssetPair, Normalization, Verdict
 from slatprep.store import Store
 from slatprep.store.record import FailedRecord
 
-# What the range would be without an asset: narrower by decades, or by its own widths.
+# An asset is named if it alone widens a range by these decades, or by these widths of the rest.
 _WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0
 
 _BESIDE_PIXIE = 0.5
-"""Decades beyond Pixie's published ranges within which PixieVerse itself may reach."""
+"""Decades by which PixieVerse itself may exceed Pixie's published ranges."""
 
 _NAMED = 3
 
 _MOST_CLIPPED = 0.25
-"""Share of values beyond a range; percentiles that people ask for leave out a tenth or a fifth."""
+"""Largest usual share of values beyond a range; usual percentiles leave out a tenth or a fifth."""
 
 
 def nothing_usable(
@@ -55,21 +55,21 @@ def nothing_usable(
 def dataset_notices(
     new: NextStore, parameters: BuildParameters, failed: Sequence[FailedRecord] = ()
 ) -> Iterator[str]:
-    """Yield what a person should know of the assets of a store together."""
+    """Yield what a person should know about the assets of a store as a whole."""
     yield from latent_warnings(new, parameters.slat.standardised)
     if not (parameters.consensus.settle or parameters.pixieverse.samples == "merge"):
         yield from shared_rotation(new)
     made = {row.asset_id: str(row.columns["unusual"]) for row in new.rows if row.spooled}
     yield from unusual_sources(made, failed)
     yield from shared_sources(new, "SLAT", slat_contents(new))
-    # Of rows that lie in another store, no column tells the grid.
+    # Rows that lie in another store have no column ``grid``.
     yield from shared_sources(new, "grid", [row.columns.get("grid") for row in new.rows])
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
         yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
 
 
 def much_clipped(store: Store) -> Iterator[str]:
-    """Yield which ranges cut off many values of a store, or most of an asset, and of which."""
+    """Yield a notice on each range that clips many values of a store, or most of an asset."""
     valid = store.column("valid_share") * np.diff(store.offsets)
     for span, counts in zip(store.normalization.ranges, store.column("clipped").T, strict=True):
         lost = [store.ids[row] for row in np.flatnonzero(counts > 0.5 * valid)]
@@ -85,9 +85,9 @@ def much_clipped(store: Store) -> Iterator[str]:
 
 
 def unusual_sources(told: Mapping[str, str], failed: Sequence[FailedRecord] = ()) -> Iterator[str]:
-    """Yield once of each kind what is unusual, by asset, and what refused values look like.
+    """Yield one notice for each kind of unusual sources, with what refused values look like.
 
-    `told` has ``asset/unusual`` of all assets by id. The records tell of each.
+    `told` has ``asset/unusual`` of all assets by id. The records have the details of each asset.
     """
     odd: dict[str, dict[str, str]] = defaultdict(dict)
     for asset_id, lines in told.items():
@@ -106,14 +106,14 @@ def unusual_sources(told: Mapping[str, str], failed: Sequence[FailedRecord] = ()
 
 
 def stored_oddities(store: Store) -> list[str]:
-    """Say what is unusual of the sources of all assets of a store, and what of it was clipped."""
+    """Return notices on unusual and shared sources of a store's assets, and on clipped values."""
     told = dict(zip(store.ids, store.column("unusual"), strict=True))
     shared = shared_sources(store, "SLAT", slat_contents(store))
     return [*unusual_sources(told), *shared, *much_clipped(store)]
 
 
 def shared_rotation(new: NextStore) -> Iterator[str]:
-    """Yield that a consensus may settle ties of new assets, where most others are turned alike."""
+    """Yield a notice if a consensus may settle ties of new assets, as most others turn alike."""
     tied = new.column("ambiguity") > THRESHOLDS.good_ambiguity
     if not any(row.spooled for row, ties in zip(new.rows, tied, strict=True) if ties):
         return
@@ -129,7 +129,7 @@ def shared_rotation(new: NextStore) -> Iterator[str]:
 def shared_sources(
     store: NextStore | Store, what: str, contents: Sequence[object]
 ) -> Iterator[str]:
-    """Yield which objects have one source, by its content; empty where it is not known."""
+    """Yield a notice if objects share a source; `contents` identify it, empty if unknown."""
     found: defaultdict[object, list[int]] = defaultdict(list)
     for at, content in enumerate(contents):
         if content:
@@ -147,9 +147,9 @@ def shared_sources(
 def wild_ranges(
     ids: Sequence[str], extents: NDArray[np.float64], normalization: Normalization
 ) -> Iterator[str]:
-    """Yield which asset alone makes a range, of mapped extents (A, P, 2), 10 times wider.
+    """Yield a notice on each asset that alone makes a range 10 times wider.
 
-    Of two assets nobody can tell which is wild.
+    `extents` are (A, P, 2) in mapped units. With two assets, either may be the wrong one.
     """
     if len(ids) < _NAMED:
         return
@@ -187,7 +187,7 @@ def _first(names: Sequence[str]) -> str:
 
 
 def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
-    """Yield what a person should know about whether the latents of a store are standardised."""
+    """Yield notices on whether the latents of a store are standardised."""
     latents = new.contents.latents
     moments = moments_of(new.rows, new.stores)
     known = [(row, own) for row, own in zip(new.rows, moments, strict=True) if own]

@@ -1,4 +1,4 @@
-"""Pack rows into the arrays of a store, a shard a task."""
+"""Pack rows into the arrays of a store, one shard per task."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ Arrays = dict[str, NDArray[Any]]
 """Rows of arrays, by their full names."""
 
 _ROWS_MOVED = 65_536
-"""Rows of an older store that are unpacked at a time, 4 MB in all arrays."""
+"""Number of rows of an older store that are unpacked at a time, 4 MB in all arrays."""
 
 _CLIPPED = {"voxel": "clipped", "grid": "clipped_grid"}
-"""Columns of what packing a group clips."""
+"""Columns with the number of values that packing clips, by group."""
 
 
 def pack_store(
@@ -61,10 +61,10 @@ def pack_store(
     jobs: Jobs,
     progress: Callable[[int, int], None] | None = None,
 ) -> frozenset[int]:
-    """Write a store and put it in place; return its shards of records that are the older store's.
+    """Write a store and put it in place; return the shards of records that were taken over.
 
-    What an older store has in the same bytes is taken over: whole shards as files, if the new
-    store replaces it, and chunks as they are packed.
+    Equal bytes of an older store are taken over: whole shards as files, if the new store replaces
+    it, and packed chunks.
     """
     with writing(str(place.out), work_directory(place.store).parent):
         path = work.scratch / "store.zarr"
@@ -76,9 +76,9 @@ def pack_store(
 def _made(
     path: Path, new: NextStore, work: Work, jobs: Jobs, progress: Callable[[int, int], None] | None
 ) -> tuple[Staged, frozenset[int]]:
-    """Make a store; return what of it is not at `path`, and its shards of records taken over.
+    """Make a store; return its files that are not at `path`, and its shards of records taken over.
 
-    Shards go to where the work says, if that is on an object store.
+    Shards go to `work.shards` if that is on an object store.
     """
     create_store(path, len(new.rows), new.offsets[-1], new.parameters, new.contents, new.merged)
     reached("store created", path.name)
@@ -91,7 +91,7 @@ def _made(
     todo = list(shards([row.where for row in new.rows], new.offsets, new.parameters, runs, taken))
     clipped = {group: new.column(name) for group, name in _CLIPPED.items()}
     here, written = remote or path, dict[str, Written]()
-    # Those of grids, which take longest, first: so the last shards keep all workers at work.
+    # Shards of grids take longest, so they go first: the last shards keep all workers busy.
     todo.sort(key=lambda shard: shard.group != "grid")
     how = new.normalization, new.contents.background, new.merged
     tasks = ((here, work.spool, new.stores, shard, *how) for shard in todo)
@@ -123,11 +123,11 @@ def write_shard(
     background: int,
     merged: bool,
 ) -> tuple[Shard, NDArray[np.int64], dict[str, Written]]:
-    """Write one shard of every array of its group into the store that is made at `path`.
+    """Write one shard of every array of its group into the new store at `path`.
 
-    It has arrays of `merged` labels, or none.
-    Returns the shard, how many values of the spool's assets lay outside the range, (A, P) by asset
-    of the shard and property, and what was written by file. No other task may have the shard.
+    `merged` says whether the store has arrays of merged labels. Return the shard, the number of
+    values of spooled assets outside the range, (A, P) by asset of the shard and property, and the
+    written files by name. No other task may write the shard.
     """
     name = f"{shard.group} {shard.start}"
     reached("shard begun", name)
@@ -167,14 +167,14 @@ def arrays_in(group: str, merged: bool) -> list[str]:
 
 
 def _follows(where: Where, asset: int) -> tuple[int, int] | None:
-    """Return what assets have in common whose rows follow one another in an older store."""
+    """Return a value that assets with adjacent rows in an older store share; None if spooled."""
     return None if isinstance(where, str) else (where[0], where[1] - asset)
 
 
 def _spooled(
     spool: Spool, key: str, group: str, own: slice, normalization: Normalization, background: int
 ) -> tuple[Arrays, NDArray[np.int64] | int]:
-    """Return rows of an asset of the spool in a group's arrays, and what was clipped (P,)."""
+    """Return rows of a spooled asset in a group's arrays, and numbers of clipped values (P,)."""
     if group == "record":
         return {RECORD_ARRAY: np.array([spool.record_text(key).decode()], object)}, 0
     if group == "voxel":
@@ -198,7 +198,7 @@ def _spooled(
 def _copy_chunks(
     writers: Mapping[str, ShardWriter], source: SourceStore, start: int, stop: int
 ) -> None:
-    """Write whole chunks, rows ``start`` to ``stop - 1`` of an older store, as they are packed."""
+    """Copy whole packed chunks, rows ``start`` to ``stop - 1`` of an older store."""
     for array, writer in writers.items():
         if not source.holds(array):
             writer.append_fill(stop - start)
@@ -216,7 +216,7 @@ def _move_rows(
     assets: Sequence[tuple[int, slice]],
     normalization: Normalization,
 ) -> None:
-    """Write rows of assets that follow one another in an older store, brought to the ranges."""
+    """Write rows of assets that are adjacent in an older store, converted to the new ranges."""
     if shard.group == "record":
         for asset, _ in assets:
             _, row, names = shard.rows[asset]
@@ -237,7 +237,7 @@ def _move_rows(
 
 
 def _append(writers: Mapping[str, ShardWriter], arrays: Arrays, rows: int) -> None:
-    """Give each writer the rows of its array; fill values where there is no such array."""
+    """Give each writer the rows of its array, or fill values if there is no such array."""
     for name, writer in writers.items():
         if name in arrays:
             writer.append(arrays[name])
@@ -248,7 +248,7 @@ def _append(writers: Mapping[str, ShardWriter], arrays: Arrays, rows: int) -> No
 def _renormaliser(
     old: Normalization, new: Normalization
 ) -> Callable[[NDArray[Any], str], NDArray[Any]]:
-    """Return what brings the rows of an array, by its name, from one set of ranges to another."""
+    """Return a function that converts rows of an array, by its name, to other ranges."""
     before, after = ([span.hi - span.lo for span in ranges.ranges] for ranges in (old, new))
     scale = np.divide(before, after)
 
@@ -265,7 +265,7 @@ def _renormaliser(
 
 
 def _runs(path: Path, group: str, new: NextStore) -> Runs:
-    """Return which rows of a group's arrays older stores have in chunks of the same bytes."""
+    """Return the rows of a group's arrays that older stores have in chunks of the same bytes."""
     alike = [_packs_alike(path, group, new, source) for source in new.stores]
     if not any(alike):
         return Runs()
@@ -280,7 +280,7 @@ def _runs(path: Path, group: str, new: NextStore) -> Runs:
 
 
 def _packs_alike(path: Path, group: str, new: NextStore, source: SourceStore) -> bool:
-    """Whether a store has a group's values as the new one, in chunks cut and packed alike."""
+    """Return whether a store has a group's values like the new one, in chunks packed alike."""
     if group != "record" and source.normalization != new.normalization:
         return False
     held = (name for name in arrays_in(group, new.merged) if source.holds(name))
@@ -288,7 +288,7 @@ def _packs_alike(path: Path, group: str, new: NextStore, source: SourceStore) ->
 
 
 def _taken(new: NextStore, runs: Mapping[str, Runs]) -> set[tuple[str, int]]:
-    """Return the shards, by group and number, that are files of the store that is replaced."""
+    """Return the shards, by group and number, that are files of the replaced store."""
     if not (new.replaces and new.stores):
         return set()
     held, taken = new.stores[0], set()
@@ -304,9 +304,9 @@ def _taken(new: NextStore, runs: Mapping[str, Runs]) -> set[tuple[str, int]]:
 
 
 def _take(path: Path, new: NextStore, taken: Collection[tuple[str, int]]) -> dict[str, Written]:
-    """Give the new store those shards; on an object store they are named alone.
+    """Put the taken shards into the new store; return their files.
 
-    There the server copies them when the others are uploaded.
+    On an object store they are only named; the server copies them when the others are uploaded.
     """
     files: dict[str, Written] = {}
     for group, number in sorted(taken):
@@ -321,7 +321,7 @@ def _take(path: Path, new: NextStore, taken: Collection[tuple[str, int]]) -> dic
 
 
 def _write_columns(path: Path, new: NextStore, found: Mapping[str, NDArray[np.int64]]) -> None:
-    """Write every ``asset/*`` array; `found` are those that packing fills, by last name."""
+    """Write every ``asset/*`` array; `found` has the columns that packing fills, by last name."""
     group = open_for_writing(path)["asset"]
     for layout in ARRAYS:
         where, _, name = layout.name.partition("/")

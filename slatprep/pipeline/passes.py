@@ -1,9 +1,9 @@
 """The passes over a whole dataset: the consensus and the witness settle ties, and judge labels.
 
-They work on what the first pass left in the spool and change nothing there: an
-asset that comes out otherwise is written again under a key of its own. Its
-record keeps what the first pass found, so the next build does not align it
-again, with these passes or without.
+They read what the first pass left in the spool and change nothing there: a
+changed asset is written again under a key of its own. Its record keeps the
+result of the first pass, so the next build does not align it again, with these
+passes or without.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from slatprep.workers.local import run_in_order, run_unordered
 
 
 def apply_passes(rows: list[Row], context: BuildContext, crew: Crew, labels: int) -> list[Row]:
-    """Settle ties by the consensus, then by the latents, as far as parameters ask for it.
+    """Settle ties by the consensus, then by the latents, if the parameters ask for it.
 
     `labels` is the number of classes that a voxel may have.
     """
@@ -49,14 +49,14 @@ class Reopened:
         self.alignment, self.judgement = self.record.alignment, self.record.judgement
 
     def place(self, alignment: Alignment, parameters: BuildParameters) -> None:
-        """Look up and judge under another alignment; fit it first if its placement is another."""
+        """Look the field up and judge with another alignment; refit it if its transform is new."""
         if alignment.transform is not self.alignment.transform:
             alignment = refit(alignment, self.field, self.latents, parameters.align)
         looked_up = look_up(self.field, self.latents, alignment, parameters.sample)
         self.alignment, (self.annotation, self.judgement) = alignment, looked_up
 
     def put(self) -> Row:
-        """Write the asset as it is now beside itself; return what the parent keeps."""
+        """Write the asset in its current state under a new key; return its row."""
         first = self.record
         record = replace(
             first,
@@ -73,8 +73,8 @@ class Reopened:
 def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> list[Row]:
     """Give ambiguous assets the placement nearest to the dataset's common rotation.
 
-    The order stays. Rows whose placement stands are the same objects: those without a tie that
-    share the rotation, and all others that neither their tie nor their heading changes.
+    The order stays. A row whose placement stays is returned as the same object: if it has no tie
+    and shares the rotation, or if the consensus changes neither its tie nor its heading.
     """
     tied = [asset for asset in assets if asset.columns["n_placements"]]
     others = [asset for asset in assets if not asset.columns["n_placements"]]
@@ -105,7 +105,7 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
 def settle_asset(
     asset: Row, spool: Spool, consensus: Consensus, parameters: BuildParameters
 ) -> Row:
-    """Settle one asset's tie, or weigh its heading; return it as it was where the choice stands."""
+    """Settle one asset's tie, or weigh its heading; return the same row if nothing changes."""
     first = Reopened(asset, spool)
     field, latents, before = first.field, first.latents, first.alignment
     alignment = settle(before, latents, consensus)
@@ -120,9 +120,9 @@ def settle_asset(
 def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: int) -> list[Row]:
     """Settle ties by the latents and mark labels that they contradict.
 
-    Assets whose verdict is good say what latents are like in each of so many `labels`, and whether
-    they can be trusted. The order stays; rows of which latents say nothing are the same objects. An
-    asset without a tie is never placed anew.
+    Assets whose verdict is good show how latents are distributed in each class, and how reliable
+    they are; `labels` is the number of classes. The order stays; a row that the latents do not
+    change is returned as the same object. An asset without a tie is never placed anew.
     """
     spool, parameters, jobs = context.spool, context.parameters, crew.of(len(assets))
     objects = [str(asset.columns["object_id"]) for asset in assets]
@@ -157,7 +157,7 @@ def read_moments(asset: Row, spool: Spool, labels: int) -> witness.Moments:
 def weigh_asset(
     asset: Row, model: witness.LatentModel, spool: Spool, parameters: BuildParameters
 ) -> witness.LatentEvidence:
-    """Return what an asset's latents say of its labels."""
+    """Return the evidence of an asset's latents on its labels."""
     first = Reopened(asset, spool)
     placed = first.field, first.latents, first.alignment, first.annotation.material
     return witness.weigh(*placed, model, parameters.sample)
@@ -171,11 +171,11 @@ def apply_latents(
     model: witness.LatentModel,
     parameters: BuildParameters,
 ) -> Row:
-    """Place one asset anew as its latents ask, or mark its labels as contradicted."""
+    """Place one asset anew by the choice of its latents, or mark its labels as contradicted."""
     first = Reopened(asset, spool)
     if choice is not None:
         number, by = choice
-        # Placement 0 is the one that the asset has: it stands, and is settled now.
+        # Placement 0 is the asset's own: it stays, and is settled now.
         chosen = replace(first.alignment, settled_by=by)
         if number:
             chosen = take(first.alignment, number - 1, first.latents, by)

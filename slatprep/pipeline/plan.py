@@ -1,7 +1,7 @@
-"""What a build will do with each asset, and why, before it does it.
+"""Plan what a build will do with each asset, and why.
 
-Sources are compared by content, but for those that the last build (`slatprep.pipeline.seen`) has
-seen as they are.
+Sources are compared by content, unless their state is the one that the last build saw
+(`slatprep.pipeline.seen`).
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most, run_unordered
 
 Note = Callable[[str], None]
-"""Called with a line for the user."""
+"""Callback that gets a line for the user."""
 
 
 @dataclass(frozen=True)
 class Crew:
-    """Who works on a build, and who is told of it.
+    """The workers of a build, and the callbacks that report on it.
 
-    `jobs` are worker processes, or a cluster's workers; no more processes are started than there
-    are `assets_per_job` assets for each. `progress` is called with the assets done and those in
-    all, at the beginning with none done. `note` gets lines for the user.
+    `jobs` are worker processes, or a cluster's workers; there are at least `assets_per_job` assets
+    for each process that is started. `progress` is called with the number of assets done and of
+    all assets, at the beginning with 0 done. `note` is called with lines for the user.
     """
 
     jobs: Jobs
@@ -47,21 +47,21 @@ class Crew:
     note: Note | None = None
 
     def of(self, assets: int) -> Jobs:
-        """Return who works on so many assets."""
+        """Return the workers for a number of assets."""
         return at_most(assets // self.assets_per_job, self.jobs)
 
     def tell(self, line: str) -> None:
-        """Give a line for the user to whoever listens."""
+        """Give a line for the user to `note`, if there is one."""
         if self.note:
             self.note(line)
 
 
 @dataclass(frozen=True)
 class BuildContext:
-    """A build, as its tasks see it.
+    """What the tasks of a build need to know about it.
 
-    `recipe` is what parameters and code come to, `spool` where finished assets go, and `previous`
-    the store that is there. With `strict`, an asset's fault is raised instead of noted.
+    `recipe` follows from parameters and code. Finished assets go to `spool`; `previous` is the
+    existing store. With `strict`, an asset's fault is raised instead of recorded.
     """
 
     parameters: BuildParameters
@@ -88,22 +88,22 @@ class Action(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlannedAsset:
-    """What will be done with one asset.
+    """The planned action for one asset.
 
     Attributes
     ----------
     asset_id : str
         Id of the row.
     action : Action
-        What is done.
+        The action.
     reason : str
-        Why, in one line.
+        Reason for it, in one line.
     key : str
-        See `slatprep.pipeline.recipe`; empty where the sources cannot be read.
+        See `slatprep.pipeline.recipe`; empty if the sources were not, or cannot be, read.
     names : mapping of str to object, or None
-        Those that its record has otherwise, such as its category or the paths of its files.
+        Names that differ from its record, such as its category or the paths of its files.
     seen : bytes
-        State of its sources as they were hashed; empty where nobody looked.
+        State of its sources; empty if they were not looked at.
     """
 
     asset_id: str
@@ -116,10 +116,10 @@ class PlannedAsset:
 
 @dataclass(frozen=True)
 class BuildPlan:
-    """What a build will do with the `assets`, sorted by id, to make or replace a `store`.
+    """The planned actions for `assets`, sorted by id, to make or replace a `store`.
 
-    `damaged` is what of the existing store is not as it was written, and will be made anew.
-    `taken_out` says by id why assets will leave it.
+    `damaged` are damaged parts of the existing store, in words, which will be made anew.
+    `taken_out` says by id why assets will leave the store.
     """
 
     store: Place
@@ -129,7 +129,7 @@ class BuildPlan:
 
     @property
     def actions(self) -> dict[str, int]:
-        """Assets by action."""
+        """Number of assets by action."""
         counts = Counter(asset.action for asset in self.assets)
         return {str(action): counts[action] for action in Action}
 
@@ -142,10 +142,10 @@ def plan_assets(
     *,
     ahead: bool = False,
 ) -> dict[str, PlannedAsset]:
-    """Say what will be done with each asset, and why, by id; with those to be removed as well.
+    """Return the planned action of each asset, by id, including assets to be removed.
 
-    `known` has state and key of assets whose sources need not be hashed again. Where nothing was
-    done before, none are, unless it is to be said `ahead` which cannot be read.
+    `known` has state and key of assets whose sources need not be hashed again. If there is no
+    earlier work, no sources are hashed, unless the plan must say `ahead` which cannot be read.
     """
     resumable = context.spool.holds_any()
     if not (ahead or resumable or context.previous is not None):
@@ -172,13 +172,13 @@ def plan_assets(
 
 
 def why_taken_out(removed: Iterable[str], refused: Collection[str] = ()) -> dict[str, str]:
-    """Say by id why assets leave a store; the `refused` are in the dataset still."""
+    """Say by id why assets leave a store; `refused` assets are still in the dataset."""
     why = "no longer in the dataset"
     return {one: "cannot be used now" if one in refused else why for one in removed}
 
 
 def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
-    """Say what will be done with one asset, and why."""
+    """Return the planned action of one asset, after hashing its sources."""
     reached("asset compared", pair.asset_id)
     with noting() as noted:
         try:
@@ -195,7 +195,7 @@ def _planned(
     digests: Mapping[str, str],
     context: BuildContext,
 ) -> PlannedAsset:
-    """See `plan_asset`, of an asset whose sources have been hashed."""
+    """Return the planned action of an asset whose sources have been hashed."""
     asset_id, recipe = pair.asset_id, context.recipe
     key = recipe.key(asset_id, digests)
     planned = partial(PlannedAsset, asset_id, key=key)
@@ -217,7 +217,7 @@ def _planned(
 
 
 def names_of(pair: AssetPair, sources: tuple[SourceFile, ...], record: AssetRecord) -> Names | None:
-    """Return what an asset and its files are called now, where its record has other names."""
+    """Return the names of an asset and its files that differ from its record; None if none do."""
     names = {name: getattr(pair, name) for name in ("object_id", "view", "category")}
     names["sources"] = sources
     return {name: own for name, own in names.items() if getattr(record, name) != own} or None

@@ -1,8 +1,8 @@
 """Publish a build: put its store in place, its manifests beside it, and say what it did.
 
 The store and its records are replaced in one step, because the records are an
-array of it. The files beside it are made from them; a build that was killed before it
-could write them is noticed by the next one, which writes them then.
+array of the store. The files beside it are made from them. If a build is killed
+before it writes them, the next build writes them.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ _MARKS = {
     ASSETS: b'"slatprep-asset-record"',
     ERRORS: b'"refitted"',
 }
-"""Files beside a store, and what each says at its beginning."""
+"""Text near the beginning of each file beside a store, which identifies the file."""
 
 _HEAD_BYTES = 4096
 
 
 class Destination:
-    """Where a store and its records go; `store` is where it really lies, behind a link.
+    """Destination of a store and its records.
 
-    `out` is the store as its user names it, `manifests` the folder of its records, if not beside
-    it. `there` is the store that is there, where it is open already; `removed` are those of its
-    assets that the new one lacks. StoreError if there is something other than a store, or the
-    folder holds files of other origin or the records of another store; ConfigError if it lies in
-    another store.
+    `out` is the store as its user names it, and `store` its real place, behind a link. `manifests`
+    is the folder of its records, if not beside it. `there` is the existing store, if it is open
+    already; `removed` are those of its assets that the new store lacks. ConfigError if there is
+    something other than a store, or it lies in another store. StoreError if the folder holds files
+    of other origin or the records of another store.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
@@ -88,13 +88,13 @@ class Destination:
         self.removed: list[str] = []
 
     def look(self) -> None:
-        """See, on an object store, what is published; raise `StoreError` if none may be there."""
+        """Read what is published on an object store; StoreError if no store may be there."""
         if self._remote is not None:
             self._before = published_state(self._remote)
 
     @contextmanager
     def telling_if_stopped(self) -> Iterator[None]:
-        """Have a KeyboardInterrupt say so if the new store may be in place by then."""
+        """Make a KeyboardInterrupt say that the new store may be in place, if it may be."""
         try:
             yield
         except KeyboardInterrupt:
@@ -104,9 +104,9 @@ class Destination:
             raise KeyboardInterrupt(told) from None
 
     def replace(self, new: Path, ids: Iterable[str], staged: Staged | None = None) -> None:
-        """Put a finished store with these ids in place; on an object store not published yet.
+        """Put a finished store with these ids in place; on an object store, do not publish it yet.
 
-        `staged` is what of it is on the object store already.
+        `staged` are its files that are on the object store already.
         """
         self.replacing = True
         self.removed = self.lost(ids)
@@ -117,8 +117,8 @@ class Destination:
         reached("store replaced", str(self.store))
 
     def lost(self, ids: Iterable[str]) -> list[str]:
-        """Return which assets of the store that is there are not among these, by id."""
-        with suppress(StoreError):  # There is none, or its ids cannot be read.
+        """Return the ids of the existing store that are not among `ids`, sorted."""
+        with suppress(StoreError):  # There is no store, or its ids cannot be read.
             return sorted(set((self.there or open_store(self.store)).ids).difference(ids))
         return []
 
@@ -128,11 +128,11 @@ class Destination:
             self._upload.publish()
 
     def in_place(self) -> Store:
-        """Open the new store, once it is in place."""
+        """Open the new store after it was put in place."""
         return open_store(self.store if self._upload is None else self._upload.version)
 
     def manifests(self, store: Place | None = None) -> Place:
-        """Return the folder of the records of a store that lies here; by default of a new one."""
+        """Return the folder of the records of a store that lies here, by default a new store."""
         version = None if self._remote is None else store
         return self._manifests or manifests_of(self.out if version is None else version)
 
@@ -157,13 +157,13 @@ def _replaceable(out: Path) -> Path:
 
 
 def _require_records(folder: Path, store: Path | None) -> None:
-    """Raise unless nothing but records of builds would be overwritten in a folder."""
+    """Raise if anything but records of builds would be overwritten in a folder."""
     if store is not None and folder.resolve().is_relative_to(store):
         raise StoreError(f"{folder}: lies in the store; expected a folder outside of it")
     require_outside(folder)
     there = [folder / BUILD] if os.path.lexists(folder / BUILD) else []
     there += stale_files(folder, ()) if folder.is_dir() else []
-    # Where one file is damaged, another identifies the folder.
+    # If one file is damaged, another identifies the folder.
     if there and not any(is_marked(file) for file in there):
         raise StoreError(
             f"{folder}: holds a {there[0].name} that is not slatprep's; expected the records of a "
@@ -172,7 +172,7 @@ def _require_records(folder: Path, store: Path | None) -> None:
 
 
 def require_records_file(file: Path) -> None:
-    """Raise ConfigError if a file to write lies in a store, or holds what is no record."""
+    """Raise ConfigError if a file to write lies in a store, or exists without records."""
     require_outside(file)
     if os.path.lexists(file) and not is_marked(file, ASSETS):
         raise ConfigError(
@@ -182,16 +182,16 @@ def require_records_file(file: Path) -> None:
 
 
 def _require_own(folder: Path, store: Path) -> None:
-    """Raise if a folder holds the records of another store, which is still there.
+    """Raise if a folder holds the records of another store that still exists.
 
-    ``demo`` and ``demo.zarr`` have one folder, by default. A store that was renamed with its
-    records keeps them, also where a new store has the old name: that one's folder is another.
+    ``demo`` and ``demo.zarr`` share a folder by default. A store that was renamed with its records
+    keeps them, even if a new store has the old name: the new store has another folder.
     """
     try:
         name = build_in(folder).store
         others = store.with_name(name), folder.with_name(name)
     except (StoreError, ValueError):
-        return  # None, or damaged ones, which are written anew.
+        return  # Missing or damaged records are written anew.
     for other in others:
         renamed = folder.name == manifests_of(store).name != manifests_of(other).name
         taken = not renamed and name != store.name and is_store(other)
@@ -203,7 +203,7 @@ def _require_own(folder: Path, store: Path) -> None:
 
 
 def is_marked(file: Path, name: str = "") -> bool:
-    """Whether a file says at its beginning that it is what a name, by default its own, means."""
+    """Return whether a file has the mark of a file called `name`, by default its own name."""
     try:
         return _MARKS.get(name or file.name, _MARKS[ASSETS]) in storage_of(file).read(_HEAD_BYTES)
     except OSError:
@@ -211,7 +211,7 @@ def is_marked(file: Path, name: str = "") -> bool:
 
 
 PROBLEMS_LISTED = 100
-"""How many problems a summary lists; the records hold all."""
+"""Largest number of problems that a summary lists; the records hold all."""
 
 
 @dataclass(frozen=True)
@@ -221,8 +221,8 @@ class BuildSummary:
     Attributes
     ----------
     records : Place
-        The JSON Lines file of asset records; of more than 1,024 assets, what their files are
-        called, with a ``*``.
+        The JSON Lines file of asset records; for more than 1,024 assets the pattern of several
+        files, with a ``*``.
     build_id : str
         Id of the build, a hash of the records' content.
     seconds : float
@@ -232,32 +232,32 @@ class BuildSummary:
     verdicts : dict
         Assets with status ``ok`` by verdict: ``good``, ``doubtful``, ``failed``.
     n_voxels, n_valid : int
-        SLAT voxels of those assets, and how many found an annotation.
+        SLAT voxels of assets with status ``ok``, and the number of them with an annotation.
     n_unphysical : int
-        PixieVerse voxels of those assets that no annotation was taken from, as no
+        PixieVerse voxels of assets with status ``ok`` that were left out, because no
         material has their properties.
     problems : tuple of (str, str)
-        Asset id and reason of the first `PROBLEMS_LISTED` that are not ``ok``.
+        Asset id and reason of the first `PROBLEMS_LISTED` assets that are not ``ok``.
     contradicted : tuple of str
-        Ids of the first `PROBLEMS_LISTED` whose latents contradict their labels.
+        Ids of the first `PROBLEMS_LISTED` assets whose latents contradict their labels.
     store : Place or None
-        The store; None where only alignments were written.
+        The store; None if only alignments were written.
     normalization : Normalization or None
         Ranges of the properties.
     clipped : dict
-        By property, values of ``voxel/properties`` that lay outside its range.
+        Number of values of ``voxel/properties`` outside the range, by property.
     warnings : tuple of str
         What a person should know about the dataset as a whole.
     damaged : tuple of str
-        What of the existing store was not as it was written, and was made anew.
+        Parts of the existing store that were damaged and were made anew, in words.
     rehash_seed : int or None
-        What the share of unchanged sources was drawn with that was hashed; None if none was.
+        Seed of the draw of unchanged sources to hash; None if none was hashed.
     removed : int
-        Assets of the store that was there which the new one lacks.
+        Number of assets of the old store that the new store lacks.
     taken_out : dict of str to str
-        Why, by id, of the first `PROBLEMS_LISTED` of them.
+        Reason, by id, for the first `PROBLEMS_LISTED` removed assets.
     unchanged : bool
-        Whether the store that was there stayed as it was.
+        Whether the existing store stayed as it was.
     """
 
     records: Place
@@ -282,16 +282,17 @@ class BuildSummary:
 
     @property
     def complete(self) -> bool:
-        """Whether every asset went in."""
+        """Whether every asset went into the store."""
         return all(count == 0 for status, count in self.statuses.items() if status != Status.OK)
 
 
 def counts_of(
     ids: Sequence[str], sizes: NDArray[np.int64], column: Callable[[str], NDArray[Any]]
 ) -> dict[str, Any]:
-    """Count what a `BuildSummary` tells of the assets that went in, by its fields.
+    """Return counts of the assets that went in, by field of a `BuildSummary`.
 
-    Of those there are ids, numbers of voxels (N,), and columns by name.
+    `ids` and `sizes` (A,), the numbers of voxels, are those of the assets. `column` returns their
+    ``asset/*`` column by name.
     """
     contradicted = sorted(ids[row] for row in np.flatnonzero(column("contradicted")).tolist())
     return {
@@ -304,7 +305,7 @@ def counts_of(
 
 
 def counts_in(store: Store) -> dict[str, Any]:
-    """Count what became of the assets of a store, see `counts_of`; by property what is clipped."""
+    """Return the counts of a store's assets, see `counts_of`, and clipped values by property."""
     clipped = store.column("clipped").sum(axis=0).tolist()
     counts = counts_of(store.ids, np.diff(store.offsets), store.column)
     return counts | {"clipped": dict(zip(store.about.property_columns, clipped, strict=True))}
@@ -313,7 +314,7 @@ def counts_in(store: Store) -> dict[str, Any]:
 def summarise(
     counts: Mapping[str, Any], failed: Sequence[FailedRecord], begin: float, **told: Any
 ) -> BuildSummary:
-    """Say what became of the assets, by counts of those that went in."""
+    """Return a summary from counts of the assets that went in, and the records of the others."""
     statuses = Counter(str(asset.status) for asset in failed)
     statuses[str(Status.OK)] = sum(counts["verdicts"].values())
     return BuildSummary(
@@ -334,10 +335,10 @@ def publish_build(
     standing: Collection[str] = (),
     **told: Any,
 ) -> BuildSummary:
-    """Publish a store that is in place, with its manifests; say what it holds, and what is told.
+    """Publish a store that is in place, with its manifests; return the build's summary.
 
-    `failed` could not go in; the files named in `standing` are not looked at. StoreError if the
-    disk does not take the manifests.
+    `failed` assets could not go in. Files named in `standing` are not checked. `told` are further
+    fields of the summary. StoreError if the manifests cannot be written.
     """
     folder, names = place.manifests(store.path), file_names(len(store))
     summary = summarise(
@@ -368,7 +369,7 @@ def publish_build(
 def _write_manifests(
     folder: Place, store: Store, record: BuildRecord, standing: Collection[str]
 ) -> None:
-    """Write lines of a store's records, and `build.json`; what says so already stays as it is."""
+    """Write the lines of a store's records, and `build.json`; leave files with equal content."""
     names = file_names(len(store))
     looked = [(n, name) for n, name in enumerate(names) if name not in standing]
     written = [_write(folder / name, lines_of(store, n)) for n, name in looked]
@@ -382,7 +383,7 @@ def _write_manifests(
 
 
 def _write(file: Place, content: bytes) -> bool:
-    """Write a file in one step, unless it is there with this content; whether it was written."""
+    """Write a file in one step, unless it has this content; return whether it was written."""
     with suppress(OSError):
         if storage_of(file).read(len(content)) == content:
             return False
@@ -392,7 +393,7 @@ def _write(file: Place, content: bytes) -> bool:
 
 
 def _is_there(folder: Place, wanted: BuildRecord) -> bool:
-    """Whether the record of a build says what it should, but for when and where it ran."""
+    """Return whether a folder has the wanted record of a build, except for time and machine."""
     try:
         found = build_in(folder)
     except StoreError:
@@ -425,7 +426,7 @@ def build_record(
 
 
 def _as_many_as_fit(failed: Iterable[FailedRecord]) -> Iterator[FailedRecord]:
-    left = MAX_BUILD_BYTES // 4  # Indented, with escapes, they take more.
+    left = MAX_BUILD_BYTES // 4  # Indented records, with escapes, take more.
     for record in failed:
         left -= len(to_json(record))
         if left < 0:

@@ -1,10 +1,9 @@
-"""What decides an asset's row: when it need not be done again, and what its record says.
+"""Recipes and records: what decides an asset's row, and when it need not be done again.
 
-Three things decide an asset's row: what its sources hold, the parameters that
-touch it, and the code with the libraries it computes with. A `Recipe` is the
-last two; with the first it gives the asset's key, which its record keeps.
-Work under the same key is the same work. Ranges, chunks, names and the times
-of files are no part of it.
+Three things decide an asset's row: the content of its sources, the parameters
+that affect it, and the code with its libraries. A `Recipe` holds the last two.
+With the first it gives the asset's key, which its record keeps. Equal keys mean
+equal work. Ranges, chunks, names and the times of files are not part of the key.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from slatprep.store.record import (
 class Recipe:
     """What an asset's numbers depend on besides its sources.
 
-    `parameters` are those that touch an asset, `versions` those of the libraries that make the
+    `parameters` are those that affect an asset, `versions` those of the libraries that make the
     numbers, and `code` is the fingerprint of the code.
     """
 
@@ -89,7 +88,7 @@ def recipe_of(parameters: BuildParameters) -> Recipe:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a build is asked for.
+    """What is asked of a build.
 
     Attributes
     ----------
@@ -98,13 +97,13 @@ class Wanted:
     recipe : Recipe
         What decides an asset's row.
     build : mapping
-        What decides the store's bytes besides, as its attribute ``build`` says it.
+        What else decides the store's bytes, as in its attribute ``build``.
     ranges : Normalization or str
-        Ranges that do not depend on the dataset, or where those of the dataset come from.
+        Ranges that do not depend on the dataset, or a text that says how they depend on it.
     declared : Contents
         What the sources hold.
     compact : bool
-        Rows by id, whatever the order of the existing store.
+        Whether rows are ordered by id, whatever the order of the existing store.
     """
 
     parameters: BuildParameters
@@ -130,23 +129,23 @@ class Wanted:
         return self.parameters.consensus.settle or self.parameters.witness.settle
 
     def has_ranges(self, store: Store) -> bool:
-        """Whether a store of the right assets has the ranges that are asked for."""
+        """Return whether a store of the right assets has the ranges that are asked for."""
         ranges = self.ranges
-        if ranges == "dataset":  # A store that was chosen or joined of others may have theirs.
+        if ranges == "dataset":  # A subset or joined store may have ranges of other assets.
             extents = store.column("extent")
             ranges = ranges_from_extents(extents, ranges, self.declared.properties)
         return ranges in (store.normalization, store.normalization.source)
 
     def allows(self, store: Store) -> bool:
-        """Whether a store of the right assets is the one that is asked for."""
+        """Return whether a store of the right assets is the one that is asked for."""
         compact = len(store.attributes["segments"]) <= 1 or not self.compact
         return store.attributes["build"] == self.build and self.has_ranges(store) and compact
 
 
 def _ranges_of(parameters: NormalizeParameters, declared: Contents) -> Normalization | str:
-    """Return ranges that do not depend on the dataset, or else where those of it come from.
+    """Return ranges that do not depend on the dataset, or a text that says how they depend on it.
 
-    That is a word that changes when they would. InputError if a file cannot be used.
+    The text changes whenever the ranges could. InputError if a file cannot be used.
     """
     ranges, by = parameters.ranges, parameters.split_by
     if ranges == "pixie":
@@ -162,14 +161,14 @@ def _ranges_of(parameters: NormalizeParameters, declared: Contents) -> Normaliza
 
 
 def origin(parameters: BuildParameters, versions: Mapping[str, str]) -> dict[str, Any]:
-    """Return what decides a store's bytes, without where files lie, as its metadata hold it."""
+    """Return what decides a store's bytes, without places of files, as its metadata hold it."""
     groups = ("align", "sample", "consensus", "witness", "normalize", "store")
     said = {group: getattr(parameters, group) for group in groups}
     document = {"name": parameters.name, "parameters": said, "versions": versions}
     return dict(orjson.loads(orjson.dumps(document)))
 
 
-@lru_cache(maxsize=1)  # It takes longer than to read an asset.
+@lru_cache(maxsize=1)  # This takes longer than reading an asset.
 def _environment() -> dict[str, str]:
     return {"slatprep": metadata.version("slatprep"), "python": platform.python_version()}
 
@@ -193,7 +192,7 @@ def record_of(asset: Finished, recipe: Recipe, key: str) -> AssetRecord:
 
 
 def _first(warnings: tuple[str, ...]) -> tuple[str, ...]:
-    """Return as many warnings as a record may hold, the last of them about the others."""
+    """Return as many warnings as a record may hold; the last one counts the others."""
     if len(warnings) <= MAX_WARNINGS:
         return warnings
     kept = warnings[: MAX_WARNINGS - 1]
@@ -207,13 +206,13 @@ def record_of_failed(
     traceback: str = "",
     status: StatusOfFailed = Status.FAILED,
 ) -> FailedRecord:
-    """Return the record of an asset that cannot go in, and why; `traceback` is of our own fault."""
+    """Return the record of an asset that cannot go in; `traceback` is of an internal error."""
     said = _said_of(pair, recipe)
     return FailedRecord(**said, reason=reason, traceback=traceback, status=status)
 
 
 def _said_of(pair: AssetPair, recipe: Recipe) -> dict[str, Any]:
-    """Return what the record of any asset says, whether it goes in or not."""
+    """Return the entries that every asset's record has, whether the asset goes in or not."""
     names = ("asset_id", "object_id", "view", "category")
     return {
         **{name: getattr(pair, name) for name in names},

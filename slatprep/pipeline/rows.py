@@ -1,6 +1,6 @@
-"""The rows of a store that is to be written: their arrays lie in the spool or in another store.
+"""The rows of the next store, whose arrays lie in the spool or in another store.
 
-Rows are taken from the store that is there, or from those that are joined.
+The other store is the existing store, or a store that is joined or chosen from.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ from slatprep.store.shard_writer import Written
 from slatprep.workers.local import Jobs
 
 PLACE_TOLERANCE = 2.0**-23
-"""Edges of the unit cube by which a place may differ: the last bit of a float32, as another
-machine may round the map otherwise."""
+"""Largest difference of a place, in edges of the unit cube: the last bit of a float32, because
+another machine may round the map differently."""
 
-# Without these no row can be told from another, or nothing be checked.
+# Without these files rows cannot be identified, or nothing can be checked.
 _NEEDED = ("asset/id/", "asset/offset/", f"{RECORD_ARRAY}/zarr.json", "file")
 
 
 class SourceStore(Store):
-    """An open store that assets are taken from; each process that gets one opens it once.
+    """An open store from which assets are taken; each process that gets it opens it once.
 
-    What the given store has read, and its open files, are shared with it.
+    It shares the data that the given store has read, and its open files.
 
-    `damaged` are files of its records that are not as they were written.
+    `damaged` are the damaged files of its records.
     """
 
     def __init__(self, store: Store, damaged: frozenset[str] = frozenset()) -> None:
-        vars(self).update(vars(store))  # What was read of it is not read again.
+        vars(self).update(vars(store))  # The store's data are not read again.
         self.damaged = damaged
-        # `StoredRecords(self)` would be a circle, whose files stay open until it is collected.
+        # `StoredRecords(self)` would be a cycle, whose files stay open until it is collected.
         self.records = StoredRecords(store)
-        # A process that lives on must not answer with what it read of an older store at the same
-        # path, whose rows may have been in another order under the same id.
+        # A process that lives on must not use data of an older store at the same path, whose
+        # rows may have been in another order under the same build id.
         self._run = uuid.uuid4().hex
 
     def __reduce__(self) -> tuple[Callable[..., SourceStore], tuple[object, ...]]:
@@ -61,16 +61,16 @@ class SourceStore(Store):
 
     @property
     def build(self) -> dict[str, Any]:
-        """Its attribute ``build``."""
+        """The store's attribute ``build``."""
         return dict(self.attributes["build"])
 
     @cached_property
     def files(self) -> dict[str, Written]:
-        """Bytes and SHA-256 of its files by name, as it holds them."""
+        """Size and SHA-256 of each file by name, as the store holds them."""
         return digests_in(self)
 
     def record(self, asset_id: str) -> AssetRecord | None:
-        """Return the record of an asset as its first pass left it, None where it is not there.
+        """Return the record of an asset as its first pass left it; None if it is not there.
 
         Raises StoreError if its file is damaged, or another version of slatprep wrote it.
         """
@@ -87,10 +87,10 @@ class SourceStore(Store):
         return self.records.text(row).encode()
 
     def has_labels_of(self, asset: Finished) -> bool:
-        """Whether the store's labels and places of an asset are those it has been given now.
+        """Return whether the store has the labels and places that an asset has now.
 
-        Where a pass over the whole dataset chose another alignment, the rows are of that one,
-        and its places alone are compared.
+        If a pass over the whole dataset chose another alignment, the rows belong to that
+        alignment, and only its places are compared.
         """
         row = self.find(asset.pair.asset_id)
         try:
@@ -115,11 +115,10 @@ def _in_this_process(path: Place, damaged: frozenset[str], run: str) -> SourceSt
 def checked_store(
     source: SourceStore, jobs: Jobs, below: str = ""
 ) -> tuple[SourceStore | None, tuple[str, ...]]:
-    """Return the store, None where no build can go on from it, and what is wrong.
+    """Return the store, or None if no build can go on from it, and its faults.
 
-    Its metadata are held against the contract, and the files whose names begin with `below`
-    against their digests; of the others the sizes are compared. What is wrong is in words,
-    sorted by file.
+    Its metadata are compared with the contract, and the files whose names begin with `below`
+    with their digests. Other files are compared by size. Faults are in words, sorted by file.
     """
     findings = {*metadata_findings(source.path), *file_findings(source, jobs, below)[1]}
     damaged = tuple(map(str, sorted(findings)))
@@ -131,14 +130,14 @@ def checked_store(
 
 
 IN_SPOOL = -1
-"""In place of the number of a store."""
+"""Number of a store for a row that lies in the spool."""
 
 MOST_BEHIND = 0.1
-"""The most assets that an update adds behind the others, as a share of those. To pack a row that is
-there takes a tenth of the time that a new asset takes."""
+"""Largest number of assets that an update adds at the end, as a share of the others. Packing an
+existing row takes a tenth of the time that a new asset takes."""
 
 Names = Mapping[str, Any]
-"""What an asset and its files are called now, by field of its record; no part of the work."""
+"""New names of an asset and its files, by field of its record; they change none of its numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,23 +149,23 @@ class Row:
     asset_id : str
         Id of the row.
     n_voxels : int
-        Its SLAT voxels.
+        Number of its SLAT voxels.
     key : str
-        Names its file in the spool.
+        Key that names its file in the spool.
     columns : mapping of str to object
-        What its record says in ``asset/*`` by last name, of a row in the spool; ``n_valid`` and
-        ``n_placements``, its distinct placements that fit about as well, and ``grid``, the digest
-        of its grid, too.
+        For a row in the spool, its values of ``asset/*`` by last name; besides ``n_valid``,
+        ``n_placements`` (distinct placements that fit about as well) and ``grid`` (the digest of
+        its grid).
     store : int
-        Which of the stores that rows are taken from has it; `IN_SPOOL` where none.
+        Number of the store that has the row, or `IN_SPOOL`.
     row : int
-        Its row there.
+        Its row in that store.
     names : mapping of str to object, or None
-        Those that its record there has otherwise.
+        Names that differ from its record in that store.
     damaged : str
-        Why, in words, what an older store holds of it was not taken over.
+        Why, in words, an older store's data of the asset were not taken over.
     seen : bytes
-        State of its sources as they were read; empty where they were not.
+        State of its sources as they were read; empty if they were not read.
     """
 
     asset_id: str
@@ -186,16 +185,16 @@ class Row:
 
     @property
     def where(self) -> Where:
-        """Where its arrays lie, for a task."""
+        """The place of its arrays, for a task."""
         return self.key if self.spooled else (self.store, self.row, self.names)
 
 
 Where = str | tuple[int, int, Names | None]
-"""Where a row's arrays lie: its key in the spool, or its store, its row there and its new names."""
+"""Place of a row's arrays: its key in the spool; or its store, its row there and its new names."""
 
 
 def moments_of(rows: Sequence[Row], stores: Sequence[SourceStore]) -> list[LatentMoments | None]:
-    """Return the moments of the latents of each row; None where they are not known."""
+    """Return the moments of the latents of each row; None if they are not known."""
     columns = (column(name, rows, stores) for name in ("latent_mean", "latent_std"))
     return [
         None if np.isnan(mean).any() else LatentMoments(tuple(mean.tolist()), tuple(std.tolist()))
@@ -204,9 +203,9 @@ def moments_of(rows: Sequence[Row], stores: Sequence[SourceStore]) -> list[Laten
 
 
 def slat_contents(store: NextStore | Store) -> list[bytes]:
-    """Return what tells the SLAT of each row from others, its size and moments; empty if unknown.
+    """Return size and moments of the SLAT of each row, which identify it; empty if unknown.
 
-    A digest of its file would not: a file may hold those of all assets.
+    A digest of its file would not identify it, because a file may hold the SLATs of all assets.
     """
     means, stds = store.column("latent_mean"), store.column("latent_std")
     told = np.column_stack([np.diff(store.offsets), means, stds])
@@ -220,20 +219,20 @@ class NextStore:
     Attributes
     ----------
     rows : sequence of Row
-        Its assets, in its order.
+        Its rows, in order.
     stores : tuple of SourceStore
-        Those that rows are taken from.
+        The stores from which rows are taken.
     normalization : Normalization
         The ranges of its properties.
     contents : Contents
-        What it holds.
+        Its properties, classes and latent space.
     build : mapping
         Its attribute ``build``.
     parameters : StoreParameters
         Sizes of its chunks and shards.
     replaces : bool
-        Whether it takes the place of the one store that rows are taken from, so that the two
-        may have files in common.
+        Whether it replaces the one store from which rows are taken, so that the two may share
+        files.
     """
 
     rows: Sequence[Row]
@@ -251,12 +250,12 @@ class NextStore:
 
     @cached_property
     def offsets(self) -> list[int]:
-        """First row of each asset in ``voxel/*``, and the last one's end."""
+        """First row of each asset in ``voxel/*``, and the end of the last asset."""
         return [0, *accumulate(row.n_voxels for row in self.rows)]
 
     @cached_property
     def merged(self) -> bool:
-        """Whether labels of any asset are merged of several annotations."""
+        """Whether labels of any asset are merged from several annotations."""
         return bool(column("merged", self.rows, self.stores).any())
 
     @cached_property
@@ -276,18 +275,18 @@ class NextStore:
         return build_id_of(head, zip(self.ids, map(bytes, self.digests), strict=True))
 
     def same_as(self, other: SourceStore) -> bool:
-        """Whether another store is this one: the same build, in the same order of rows."""
+        """Return whether another store equals this one: the same build, with rows in this order."""
         return self.build_id == other.about.manifest and self.ids == other.ids
 
     def column(self, name: str) -> NDArray[Any]:
-        """Return an ``asset/*`` array by its last name; of what packing clips, what is known."""
+        """Return an ``asset/*`` array by its last name; spooled rows have no clipped values yet."""
         if name in ("id", "offset"):
             return np.array(self.ids, object) if name == "id" else np.array(self.offsets, np.int64)
         if name == "record_sha256":
             return self.digests
         values = column(name, self.rows, self.stores)
         if name == "property_ambiguity":
-            # Of the spool in mapped units, as ranges come from the dataset.
+            # Spooled rows have it in mapped units, because ranges come from the dataset.
             other = [source.normalization != self.normalization for source in self.stores]
             at = [k for k, row in enumerate(self.rows) if row.spooled or other[row.store]]
             for k, row in ((k, self.rows[k]) for k in at if not self.rows[k].spooled):
@@ -299,7 +298,7 @@ class NextStore:
 
 
 def column(name: str, rows: Sequence[Row], stores: Sequence[SourceStore]) -> NDArray[Any]:
-    """Return an ``asset/*`` array (A, ...) of rows, by its last name, as it lies there."""
+    """Return an ``asset/*`` array (A, ...) of rows, by last name, as spool and stores hold it."""
     parts: list[tuple[list[int], Any]] = []
     made = [k for k, row in enumerate(rows) if row.spooled]
     if made:
@@ -321,17 +320,17 @@ def column(name: str, rows: Sequence[Row], stores: Sequence[SourceStore]) -> NDA
 
 
 def record_text(source: SourceStore, row: int, names: Names | None) -> bytes:
-    """Return the record of a row of a store, with other names where there are any."""
+    """Return the record of a row of a store as JSON, with new names if there are any."""
     if names:
         return to_json(replace(source.records.read(row), **names))
     return source.text(row)
 
 
 def in_order(rows: Sequence[Row], previous: SourceStore | None, compact: bool) -> list[Row]:
-    """Return rows by id, or as in the existing store with new ones last.
+    """Return rows ordered by id, or as in the existing store with new rows last.
 
-    They are by id if `compact`, and where so many are new that packing all rows again costs no
-    more than they do.
+    The order is by id if `compact`, or if so many rows are new that packing all rows again costs
+    no more than the new assets do.
     """
     by_id = sorted(rows, key=lambda row: row.asset_id)
     if compact or previous is None:

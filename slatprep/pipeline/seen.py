@@ -1,9 +1,9 @@
-"""What a build has seen of its sources, for the next one: their states, and the keys they gave.
+"""Keep the states of a build's sources, and the keys of its assets, for the next build.
 
-`slatprep.storage.states` says when a state of a source proves that its content is the same. It is
-taken as the source is read, and beside it stands the key that the content gave. The file
-`NAME` lies beside the records of a build; it holds for this machine, this store and the same code
-and parameters. Where anything of that is otherwise, the sources are hashed.
+`slatprep.storage.states` says when a state of a source proves that its content is the same. The
+state is taken as the source is read, and kept with the key that the content gave. The file `NAME`
+lies beside the records of a build. It is valid for this machine, this store and the same code and
+parameters; otherwise the sources are hashed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from slatprep.storage.place import storage_of
 from slatprep.storage.states import Noted, States, boot_id
 
 NAME = "sources.seen"
-"""Of the file, in the folder of the records, or on this machine's disk where those are not."""
+"""Name of the file, in the records' folder, or on this disk if the records are elsewhere."""
 
 _FORMAT = "slatprep-seen-5"
 _STATE = 16
@@ -36,9 +36,9 @@ _UNKNOWN = bytes(_STATE)
 
 
 def read_seen(folder: Path, bound: bytes) -> tuple[dict[bytes, str], bytes]:
-    """Read what the last build saw; nothing where no whole file is bound to the same.
+    """Read what the last build saw; nothing unless there is a whole file with the same `bound`.
 
-    Returns the key of each of the store's assets by the state of its sources, and the state of the
+    Return the key of each of the store's assets by the state of its sources, and the state of the
     store's files and records when it was finished; zeros if that state was not known.
     """
     try:
@@ -57,10 +57,10 @@ def read_seen(folder: Path, bound: bytes) -> tuple[dict[bytes, str], bytes]:
 def write_seen(
     folder: Path, bound: bytes, store: bytes, states: Iterable[bytes], keys: NDArray[np.uint8]
 ) -> None:
-    """Note the state of the sources of each asset of a store, empty where unknown, and its key.
+    """Write the state of the sources of each asset of a store, empty if unknown, and its key.
 
-    The file is written in place: half of one is noticed by its checksums, and costs
-    the next build some hashing. So does a disk that does not take it.
+    The file is written in place. Checksums reveal a partial file, which costs the
+    next build some hashing. So does a file that cannot be written.
     """
     held = b"".join(own or _UNKNOWN for own in states)
     texts = {"bound": bound, "store": store or bytes(32), "states": held}
@@ -71,7 +71,7 @@ def write_seen(
 
 
 def bound_to(build_id: str, recipe: str) -> bytes:
-    """Return what states hold for: this machine, a build's store, and the recipe of its assets."""
+    """Return a digest of this machine, a build's store and its recipe, for which states hold."""
     machine = Path("/etc/machine-id")
     try:
         name = machine.read_text()
@@ -82,7 +82,7 @@ def bound_to(build_id: str, recipe: str) -> bytes:
 
 
 def look(pairs: Sequence[AssetPair]) -> dict[str, bytes]:
-    """Return the state of each asset's sources as they are, 16 bytes; zeros where none counts."""
+    """Return the current state of each asset's sources, 16 bytes; zeros if it does not count."""
     states = States()
     return {
         pair.asset_id: _state_of(pair, lambda file: storage_of(file).state(states))
@@ -91,9 +91,9 @@ def look(pairs: Sequence[AssetPair]) -> dict[str, bytes]:
 
 
 def as_read(pair: AssetPair, noted: Mapping[str, Noted]) -> bytes:
-    """Return the state of an asset's sources as it was noted when they were read; see `look`."""
+    """Return the state of an asset's sources as noted when they were read; see `look`."""
     state = _state_of(pair, lambda file: noted.get(str(file)))
-    # Its reader may have read what `look` does not know of.
+    # The reader may have read files that `look` does not know.
     return _UNKNOWN if noted.keys() - {str(file) for file in _files(pair)} else state
 
 
@@ -112,7 +112,7 @@ def _state_of(pair: AssetPair, state_of: Callable[[Place], Noted]) -> bytes:
 
 
 def _files(pair: AssetPair) -> list[Place]:
-    """Return the files of an asset, in an order; none where they cannot be told."""
+    """Return the files of an asset in a fixed order; none if they are unknown."""
     try:
         texture = pair.slat and texture_of(pair.slat, pair.roots.contents.latents)
     except InputError:

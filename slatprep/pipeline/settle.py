@@ -27,13 +27,13 @@ from slatprep.workers.local import Jobs, run_unordered
 _SIGN = np.uint32(1 << 31)
 
 _HALF = 16
-"""Bits of a value that are counted at a time."""
+"""Number of bits of a value that are counted at a time."""
 
 
 def settle_rows(
     assets: Sequence[Row | FailedRecord], before: Before, context: BuildContext, crew: Crew
 ) -> tuple[NextStore, list[FailedRecord]]:
-    """Return the next store of `assets`, and those that cannot go in, by id.
+    """Return the next store of `assets`, and the assets that cannot go in, by id.
 
     Rows that lie in the existing store stay there. StoreError if no asset can be used.
     """
@@ -68,8 +68,8 @@ def kept_rows(
 ) -> list[Row]:
     """Return the rows of unchanged assets, if they can be taken over; else none.
 
-    They can where the ranges stay as they are, no pass over the whole dataset may
-    change them, and the rest of what decides a store's bytes is the same.
+    They can be if the ranges stay, no pass over the whole dataset may change the
+    rows, and the rest of what decides a store's bytes is the same.
     """
     previous, wanted = before.previous, before.wanted
     if previous is None or before.damaged or not unchanged:
@@ -85,8 +85,8 @@ def kept_rows(
         rows.append(Row(planned.asset_id, sizes[row], store=0, row=row, names=names, seen=seen))
     everything = [*rows, *(asset for asset in made if isinstance(asset, Row))]
     if len(everything) == len(rows) == len(previous) and not any(row.names for row in rows):
-        # A build of these assets would make the same again. A subset and joined stores have ranges
-        # and placements of other assets, but where the rows alone show that these are the same.
+        # A build of these assets would make the same rows. Subsets and joined stores have ranges
+        # and placements of other assets, unless the rows alone show that these are the same.
         by_rows = wanted.ranges == "dataset" or isinstance(wanted.ranges, Normalization)
         same = before.built or (by_rows and not wanted.passes)
         return rows if same and wanted.has_ranges(previous) else []
@@ -95,7 +95,7 @@ def kept_rows(
     ranges = wanted.ranges
     if isinstance(ranges, str):
         if wanted.parameters.normalize.objects != "all" or percentiles_of(ranges):
-            return []  # Such ranges are of the values of all fields.
+            return []  # Such ranges depend on the values of all fields.
         extents = column("extent", everything, (previous,))
         ranges = ranges_from_extents(extents, ranges, declared.properties)
     return rows if ranges == previous.normalization else []
@@ -104,13 +104,13 @@ def kept_rows(
 def resolved_contents(
     rows: Sequence[Row], stores: Sequence[SourceStore], declared: Contents, standardised: str
 ) -> Contents:
-    """Return what a store holds, its latents as `resolve_latents` finds them to be."""
+    """Return the contents of a store, with the latent space that `resolve_latents` finds."""
     moments = list(zip((row.n_voxels for row in rows), moments_of(rows, stores), strict=True))
     return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
 
 
 def check_objects(pairs: Sequence[AssetPair], parameters: NormalizeParameters) -> None:
-    """Raise what `dataset_ranges` would of a split that cannot be made, before hours of work."""
+    """Raise, before hours of work, what `dataset_ranges` raises if a split cannot be made."""
     if parameters.objects == "train":
         objects = {pair.object_id: pair.category for pair in pairs}
         _trained(objects, parameters, {pair.asset_id: pair.object_id for pair in pairs})
@@ -119,13 +119,13 @@ def check_objects(pairs: Sequence[AssetPair], parameters: NormalizeParameters) -
 def dataset_ranges(
     usable: Sequence[Row], spool: Spool, wanted: Wanted, jobs: Jobs
 ) -> Normalization:
-    """Return the ranges that are given, or those of the usable assets' fields.
+    """Return the given ranges, or the ranges of the usable assets' fields.
 
-    Those are their extent, or percentiles over the annotated voxels of all fields together, each
-    alike and each field once, interpolated in mapped units, as numpy and Pixie
-    (``inspect_ranges.py``, which draws 2,000,000 of them) do; of annotations that are merged, the
-    first counts. ConfigError if no object is trained on or a split cannot be made, InputError if a
-    file of ids cannot be used.
+    The fields' ranges are their extent, or percentiles over the annotated voxels of all fields
+    together. Voxels have equal weights, and each field counts once. Percentiles are interpolated in
+    mapped units, as in numpy and Pixie (``inspect_ranges.py``, which draws 2,000,000 voxels). For
+    percentiles only the first of merged annotations counts. ConfigError if no object is trained on
+    or a split cannot be made, InputError if a file of ids cannot be used.
     """
     source, parameters = wanted.ranges, wanted.parameters.normalize
     if isinstance(source, Normalization):
@@ -145,7 +145,7 @@ def dataset_ranges(
 
 
 def _chosen(usable: Sequence[Row], parameters: NormalizeParameters) -> Sequence[Row]:
-    """Return the assets of the objects that count."""
+    """Return the assets of the objects from which ranges are taken."""
     if parameters.objects != "train":
         return usable
     valid = [asset for asset in usable if asset.columns["n_valid"]]
@@ -158,7 +158,7 @@ def _chosen(usable: Sequence[Row], parameters: NormalizeParameters) -> Sequence[
 
 
 def _field_of(asset: Row) -> tuple[str, str]:
-    """Return what tells an asset's field from others: views of an object have it in common."""
+    """Return a value that identifies an asset's field, which views of an object share."""
     object_id, view = str(asset.columns["object_id"]), str(asset.columns["view"])
     return object_id, asset.asset_id.removeprefix(object_id).removeprefix(f".{view}")
 
@@ -184,7 +184,7 @@ def _counted(
     columns: int,
     upper: NDArray[np.uint32] | None = None,
 ) -> NDArray[np.int64]:
-    """Add up what `count_halves` returns for each field, (P, R, 65536)."""
+    """Return the sum of `count_halves` over all fields, (P, R, 65536)."""
     shape = (columns, 1) if upper is None else upper.shape
     totals = np.zeros((*shape, 1 << _HALF), np.int64)
     for counted in run_unordered(count_halves, ((spool, key, upper) for key in keys), jobs):
@@ -196,11 +196,11 @@ def _counted(
 def count_halves(
     spool: Spool, key: str, upper: NDArray[np.uint32] | None
 ) -> list[tuple[NDArray[np.uint32], NDArray[np.int64]]]:
-    """Count a field's values by halves of their bits, brought to an order that is the values'.
+    """Count a field's values by one half of their bits, which sort like the values.
 
-    By the upper 16 bits of each property; or, for each of `upper`, (P, R), by the lower 16 bits of
-    a property's values that have this upper half. So two passes find any value by its rank in a
-    memory that does not grow with their number.
+    Without `upper`, count each property's values by their upper 16 bits. Otherwise, for each upper
+    half in `upper` (P, R), count the property's values that have it by their lower 16 bits. So two
+    passes find the value of any rank, in memory that does not grow with the number of values.
     """
     bits = _in_order(spool.field(key).properties).T
     if upper is None:
@@ -213,8 +213,8 @@ def count_halves(
 
 
 def _in_order(values: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Return the bits of floats so changed that they have the floats' order."""
-    # Minus zero is no less than zero.
+    """Return the bits of floats, changed so that they sort like the floats."""
+    # Adding zero turns minus zero into zero.
     bits = np.ascontiguousarray(values + np.float32(0)).view(np.uint32)
     ordered: NDArray[np.uint32] = np.where(bits >> 31, ~bits, bits | _SIGN)
     return ordered
@@ -228,9 +228,9 @@ def _of_ranks(ordered: NDArray[Any]) -> NDArray[np.float32]:
 def _at(
     counts: NDArray[np.int64], ranks: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Return the value of each rank, (P, R), and its rank among equal ones.
+    """Return the value at each rank, (P, R), and its rank among equal values.
 
-    Of values `counts`, (P, 1, V) or (P, R, V), tell how often each occurs.
+    `counts`, (P, 1, V) or (P, R, V), has the number of times that each value occurs.
     """
     ends = counts.cumsum(axis=-1)
     values = (ends <= ranks[..., None]).sum(axis=-1)

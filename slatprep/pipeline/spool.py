@@ -1,11 +1,11 @@
 """Finished assets as files, between the pass that aligns and the pass that packs.
 
-A worker leaves an asset's arrays here, in SI units, and hands the parent only
+A worker writes an asset's arrays here, in SI units, and returns to the parent only
 a `slatprep.pipeline.rows.Row`, so the parent's memory does not grow with voxels. A file is
-named by its asset's key (see `slatprep.pipeline.recipe`), so what an interrupted build
-finished is found again by the next one, and only by one that would write the
-same. It appears under its name when it is whole, and holds a checksum of
-every array, so one that a power failure tore is known and done again.
+named by its asset's key (see `slatprep.pipeline.recipe`). So the next build finds what an
+interrupted build finished, but only if it would write the same. A file gets its name when it is
+whole, and has a checksum of every array. So damage by a power failure is noticed, and the asset is
+done again.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ _TORN = (OSError, ValueError, KeyError, StoreError)
 
 
 class Spool:
-    """A directory of finished assets, which on a disk must exist.
+    """A directory of finished assets; a directory on a disk must exist.
 
-    It keeps arrays, or records alone.
+    It keeps `arrays`, or only records.
     """
 
     def __init__(self, directory: Place, arrays: bool = True) -> None:
@@ -62,9 +62,9 @@ class Spool:
         annotation: Annotation,
         others: Sequence[MaterialField] = (),
     ) -> Row:
-        """Write an asset's record and arrays; return its row. StoreError if the disk refuses.
+        """Write an asset's record and arrays; return its row. StoreError if that fails.
 
-        Of `others`, the further fields whose annotations are merged, the extent alone is kept.
+        `others` are further fields whose annotations are merged; only their extent is kept.
         """
         least, most = np.array([property_extent(own, field.table) for own in (field, *others)]).T
         extent = np.stack([np.nanmin(least, axis=1), np.nanmax(most, axis=1)], axis=1)
@@ -86,21 +86,21 @@ class Spool:
         return row_of(record, text, extent)
 
     def find(self, key: str) -> tuple[AssetRecord, Row] | None:
-        """Return a finished asset, or None if there is none under this key that is whole."""
+        """Return a finished asset, or None if there is no whole file under this key."""
         try:
             with self._open(key) as file:
-                arrays = dict(file)  # Reads, so checks, them all.
+                arrays = dict(file)  # This reads all arrays, and so checks them.
             text = arrays["record"].tobytes()
             record = read_record(AssetRecord, text, str(self._path(key)))
             extent = arrays["extent"]
         except _TORN:
             return None
         if self.arrays and "coords" not in arrays:
-            return None  # Finished by an alignment without a store.
+            return None  # An alignment without a store finished it.
         return record, row_of(record, text, extent)
 
     def holds_any(self) -> bool:
-        """Whether anything at all is finished."""
+        """Return whether any asset is finished."""
         directory = storage_of(self.directory).local
         if directory is None:
             return any(name.endswith(".arrays") for name in storage_of(self.directory).files())
@@ -116,19 +116,19 @@ class Spool:
         """Remove everything but these assets' files, if no other build is at work there.
 
         `mark` is the object that says that this build is at work; it is removed in any case.
-        Returns the marks of other builds; where there are any, no asset was removed. StoreError or
-        OSError if the place cannot be listed, or the files not be removed.
+        Return the marks of other builds; if there are any, no asset was removed. StoreError or
+        OSError if the place cannot be listed, or the files cannot be removed.
         """
         storage = storage_of(self.directory)
         kept = {f"{key[:2]}/{key}.arrays" for key in keys}
-        # Below the URL of a store others may keep what is theirs.
+        # Others may keep objects of their own below the URL of a store.
         ours = [n for n in storage.files() if storage.remote is None or is_spooled(n)]
         others = [n for n in ours if n.startswith(f"{BUILDER}-") and n != mark]
         storage.remove(n for n in ours if n not in kept and (n == mark or not others))
         return others
 
     def asset(self, key: str) -> tuple[AssetRecord, MaterialField, StructuredLatents, Annotation]:
-        """Read an asset back: its record, field and SLAT, and what was looked up at its voxels."""
+        """Read an asset back: its record, field, SLAT and annotation."""
         with self._open(key) as arrays:
             text, field, voxels = arrays["record"].tobytes(), _field_in(arrays), _voxels_in(arrays)
             resolution = int(arrays["slat_resolution"])
@@ -199,12 +199,12 @@ def _field_in(arrays: ArrayFile) -> MaterialField:
 
 
 def row_of(record: AssetRecord, text: bytes, extent: NDArray[np.float64]) -> Row:
-    """Return the row of a finished asset with this record, extent (P, 2) of its properties."""
+    """Return the row of a finished asset, from its record and its properties' extent (P, 2)."""
     columns: dict[str, Any] = {
         **columns_of(record),
         "record_sha256": np.frombuffer(digest_of(text), np.uint8),
         "extent": extent,
-        "clipped": np.zeros(len(extent), np.int64),  # As long as nothing is packed.
+        "clipped": np.zeros(len(extent), np.int64),  # Packing counts them.
         "clipped_grid": np.zeros(len(extent), np.int64),
         "n_valid": record.counts.valid,
         "n_placements": len(record.alignment.placements),

@@ -1,18 +1,18 @@
-"""The folder beside a result in which it is made: one build at a time, and resumable.
+"""The work folder beside a result: for one build at a time, and resumable.
 
 ``.NAME.work`` lies beside NAME, on its file system. It holds the lock, the
-spool of finished assets and what this build alone writes. A build that is
-killed leaves it; the next one to the same target removes all but the spool
-and goes on from there. Where others may write beside NAME, something else may
-lie there under that name: only a folder that a build of this user made is
-taken, and only what builds make is removed from it.
+spool of finished assets and the files of this build alone. A killed build
+leaves it. The next build to the same target removes all but the spool, and
+goes on from there. If others may write beside NAME, something else may lie
+there under that name. So a build takes only a folder that a build of this
+user made, and removes from it only what builds make.
 
-Where workers have disks of their own and the store belongs on an object store,
-the spool lies there, below the store's URL, and so does the version that they
-write; the work folder then holds what the command itself writes. The lock does
-not keep builds on other machines out, so each marks the spool while it is at work,
-and finished assets are removed only where there is no other's mark. A build that
-is killed leaves its mark; the next one from the same work folder takes it over.
+If workers have disks of their own and the store belongs on an object store,
+the spool and the version that they write lie below the store's URL. The work
+folder then holds only what the command itself writes. The lock does not keep
+out builds on other machines. So each build marks the spool while it works, and
+removes finished assets only if no other build's mark is there. A killed build
+leaves its mark; the next build from the same work folder takes it over.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ LOCK, _PREFIX = "lock", "build-"
 
 @dataclass(frozen=True)
 class Work:
-    """Where a build works.
+    """The places in which a build works.
 
-    The `spool` of finished assets outlives a build that is interrupted. `scratch` is a folder of
-    this build alone, with a name that no other build had. Workers put the shards of the new store
-    below `shards`. The object `mark` of a spool below a store says that this build is at work; else
-    it is empty.
+    The `spool` of finished assets outlives an interrupted build. `scratch` is a folder of this
+    build alone, with a name that no other build had. Workers write the shards of the new store
+    below `shards`. `mark` is the name of the object that marks a spool below a store as in use by
+    this build; for other spools it is empty.
     """
 
     spool: Spool
@@ -56,7 +56,7 @@ class Work:
     mark: str = ""
 
     def shared(self) -> Place:
-        """Make a place that all workers must see, and return it; StoreError if that cannot be."""
+        """Make a place that all workers must see, and return it; StoreError if that fails."""
         if not self.mark:
             return self.scratch
         place = self.spool.directory / self.mark
@@ -65,9 +65,9 @@ class Work:
         return place
 
     def keep_only(self, keys: set[str]) -> bool:
-        """Remove other assets than these from the spool, and the mark; whether that was possible.
+        """Remove all assets but these, and the mark, from the spool; return False if that fails.
 
-        What goes wrong is a warning: the store is complete, and the next build will try again.
+        A failure is only a warning: the store is complete, and the next build will try again.
         """
         try:
             others = self.spool.keep_only(keys, self.mark)
@@ -82,7 +82,7 @@ class Work:
         return True
 
     def unmark(self) -> bool:
-        """Remove the mark alone; whether that was possible."""
+        """Remove only the mark; return whether that was possible."""
         try:
             storage_of(self.spool.directory).remove([self.mark])
         except FileNotFoundError:
@@ -108,11 +108,11 @@ def work_beside(
 ) -> Iterator[Work]:
     """Make the work folder of a target, hold its lock, and clean up.
 
-    The spool keeps `arrays`, or records alone; it begins empty with `fresh`, and stays after
-    success with `keep`. `look` is called with the lock held, before anything is written, and raises
-    what the target is refused for. With `private_disks` workers have no disk in common, so the
-    spool lies where the target is. StoreError if the folder cannot be written or is not a build's,
-    or another build has the lock or, with `fresh`, uses the spool; it names that build.
+    The spool keeps `arrays`, or only records. It begins empty with `fresh`, and stays after success
+    with `keep`. `look` is called with the lock held, before the target is written, and raises an
+    error if the target is refused. With `private_disks` workers share no disk, so the spool lies
+    at the target. StoreError if the folder cannot be written or is not a build's, or another build
+    has the lock or, with `fresh`, uses the spool; it names that build.
     """
     directory = work_directory(target)
     folder, remote = directory / SPOOL, storage_of(target).remote if private_disks else None
@@ -147,7 +147,7 @@ def work_beside(
         finished = True
     except KeyboardInterrupt:
         if lock is None:
-            with suppress(OSError):  # Not empty: of a build before, or one that has the lock.
+            with suppress(OSError):  # Not empty if another build left it, or has the lock.
                 directory.rmdir()
         raise
     finally:
@@ -161,7 +161,7 @@ def work_beside(
 
 
 def _clear(directory: Path, work: Work | None, all_assets: bool) -> None:
-    """Remove the mark, finished assets if they are not needed any more, and then the folder."""
+    """Remove the mark, the finished assets if nothing needs them, and then the folder."""
     if work is not None and work.mark:
         cleared = work.keep_only(set()) if all_assets else work.unmark()
         if cleared:
@@ -170,9 +170,9 @@ def _clear(directory: Path, work: Work | None, all_assets: bool) -> None:
     if all_assets or not Spool(folder).holds_any():
         shutil.rmtree(folder, ignore_errors=True)
         if not any(directory.glob(f"{BUILDER}-*")):
-            # Last, as a folder without a lock is not taken for a build's.
+            # The lock goes last, because a folder without a lock does not count as a build's.
             (directory / LOCK).unlink(missing_ok=True)
-        with suppress(OSError):  # Somebody's files, or the next build's lock.
+        with suppress(OSError):  # It may hold somebody's files, or the next build's lock.
             directory.rmdir()
 
 
@@ -188,9 +188,9 @@ def spool_of(target: Place, private_disks: bool, arrays: bool = True) -> Spool:
 
 
 def _mark(directory: Path) -> str:
-    """Return this build's mark: that of a build that was killed in this work folder, or a new one.
+    """Return this build's mark: the mark of a build killed in this work folder, or a new mark.
 
-    The lock, which is held, tells that that build has ended.
+    This build holds the lock, so that other build has ended.
     """
     there = sorted(p.name for p in directory.glob(f"{BUILDER}-*") if is_spooled(p.name))
     name = there[0] if there else f"{BUILDER}-{secrets.token_hex(8)}"
@@ -216,12 +216,12 @@ def _making(directory: Path) -> Iterator[None]:
 
 
 def _claim(directory: Path) -> None:
-    """Make the work folder, which nobody else may enter, or see that a build of this user did."""
+    """Make the work folder for this user alone, or check that a build of this user made it."""
     directory.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
         directory.mkdir(mode=0o700)
-    # Not by our user id: on a network file system our files may have another owner.
-    # A file without a name, where the system can: a signal leaves nothing behind.
+    # Not by our user id, because our files on a network file system may have another owner.
+    # The file has no name if the system can do that, so a signal leaves nothing behind.
     with tempfile.TemporaryFile(dir=directory.parent) as ours:
         owner = os.fstat(ours.fileno()).st_uid
     try:
@@ -232,7 +232,7 @@ def _claim(directory: Path) -> None:
             raise _refusal(directory, f"belongs to user {state.st_uid}")
         names = {path.name for path in directory.iterdir()}
     except FileNotFoundError:
-        return  # A build has just ended there, and taking the lock makes it again.
+        return  # A build has just ended there, and taking the lock makes the folder again.
     if names and LOCK not in names:
         raise _refusal(directory, f"holds {min(names)} and was not made by a build")
 
