@@ -1,10 +1,10 @@
 """SLAT-Phys's decoder: a sparse Swin transformer over occupied voxels, in plain PyTorch.
 
-The architecture is that of TRELLIS's sparse Swin decoders: pre-norm blocks of multi-head
-attention within windows of 8^3 voxels, shifted by half a window in every other block (Liu et
-al., "Swin Transformer", ICCV 2021), an MLP of four times the width, layer norms without
-parameters, and a sinusoidal embedding of the absolute position. With the widths, depths and
-heads of SLAT-Phys it has the numbers of parameters that SLAT-Phys states.
+The architecture is that of TRELLIS's sparse Swin decoders. Pre-norm blocks have multi-head
+attention within windows of 8^3 voxels, shifted by half a window in every other block (Liu et al.,
+"Swin Transformer", ICCV 2021). They have an MLP of four times the width, and layer norms without
+parameters. The absolute position has a sinusoidal embedding. With the widths, depths and heads of
+SLAT-Phys it has the numbers of parameters that SLAT-Phys states.
 """
 
 from __future__ import annotations

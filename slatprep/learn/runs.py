@@ -176,7 +176,7 @@ class Run:
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; an existing one is replaced when the new one is complete."""
         buffer = BytesIO()
-        torch.save(state, buffer)  # Straight to a full disk, it raises no OSError.
+        torch.save(state, buffer)  # On a full disk torch.save raises no OSError.
         with staged(self.path / name) as path:
             path.write_bytes(buffer.getbuffer())
 

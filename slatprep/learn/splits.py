@@ -42,9 +42,9 @@ def select_assets(
 ) -> NDArray[np.int64]:
     """Return the rows (K,) of the assets in a split, in the order of the store.
 
-    Assets must have one of `verdicts` and at most `max_ambiguity`; an ambiguity of NaN is too much.
-    Assets without a valid voxel have no labels, and are left out. `splits` gives the split of each
-    object by id, by default the split by hash. ConfigError if split or verdict is unknown.
+    Assets must have one of `verdicts`, and an ambiguity of at most `max_ambiguity`, not NaN. Assets
+    without a valid voxel have no labels, and are left out. `splits` gives the split of each object
+    by id, by default the split by hash. ConfigError if split or verdict is unknown.
     """
     if split is not None:
         require_one_of("split", split, SPLITS)

@@ -202,9 +202,9 @@ class NormalizeParameters(_Group):
     """Origin of the ranges.
 
     `ranges` is ``dataset`` (its minimum and maximum), percentiles of it such as ``p1-p99``,
-    ``pixie``, or the path of a TOML, JSON or YAML file. The dataset's ranges come from ``all`` its
-    `objects`, or from the objects of ``train``, which `split_by` and `shares` define: see
-    `slatprep.readers.splits.assign_splits`.
+    ``pixie``, or the path of a TOML, JSON or YAML file. The dataset's ranges come from the objects
+    that `objects` names: ``all``, or ``train``. `split_by` and `shares` define the training
+    objects, see `slatprep.readers.splits.assign_splits`.
     """
 
     ranges: str = "dataset"

@@ -71,8 +71,8 @@ class VoxelField:
 def stored_field(store: Store, name: str | int, points: Points = "slat") -> VoxelField:
     """Return an asset's materials at its valid SLAT voxels, or at its field's voxels (``grid``).
 
-    StoreError if the store has no such asset, lacks a property or has classes of its own;
-    ConfigError if no voxel of the asset has a material.
+    StoreError if the store has no such asset, lacks a property, or has classes that solvers do not
+    know. ConfigError if no voxel of the asset has a material.
     """
     asset, columns = store.asset(name), store.columns_of(PROPERTY_COLUMNS)
     require_solver_classes(store)

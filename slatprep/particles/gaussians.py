@@ -50,7 +50,7 @@ def bind(points: NDArray[np.float64], rest: NDArray[np.float64], spacing: float)
 def carry(
     carrier: Carrier, positions: NDArray[np.floating], gradients: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return places (G, 3) and gradients (G, 3, 3) of Gaussians from positions and gradients.
+    """Return places (G, 3) and gradients (G, 3, 3) of Gaussians from those of their particles.
 
     Each particle moves its surroundings by its position and its deformation gradient; the
     Gaussian takes the weighted mean.

@@ -78,7 +78,7 @@ def simulate_motion(
     builder.add_particles(
         pos=[warp.vec3(*point) for point in rest],
         vel=[warp.vec3(0.0)] * len(rest),
-        mass=np.where(held, 0.0, mass).tolist(),  # For the engine 0 is infinite.
+        mass=np.where(held, 0.0, mass).tolist(),  # The engine treats 0 as infinite.
         radius=[spacing / 2] * len(rest),
     )
     builder.add_ground_plane()

@@ -179,7 +179,7 @@ def _hash_slat(
 
 
 def reading_of(roots: SourceRoots) -> dict[str, str]:
-    """Return the options that decide how files are read, by name, without those at the default."""
+    """Return by name the options that change how files are read; empty if all are at default."""
     space, reading = roots.contents.latents, {}
     if roots.adapter != SourceRoots.adapter:
         reading["adapter"] = f"{roots.adapter} {made_by('slatprep.sources', roots.adapter)}"

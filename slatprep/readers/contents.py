@@ -39,7 +39,7 @@ def contents_of(parameters: BuildParameters) -> Contents:
     Raises
     ------
     ConfigError
-        If a source is not described, or a further source holds what the first one does not.
+        If a source has no usable description, or a further source has other properties or classes.
     """
     held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
     for number, source in enumerate(parameters.also, 1):
@@ -78,7 +78,7 @@ def _described(one: Property) -> str:
 _WIDE_ALONE = 1.2
 """Standard deviation of the median channel above which the latents of a single asset are raw.
 
-A dataset's standardised channels have 1, and those of three real SLATs, each alone, 0.66 to 0.79.
+A dataset's standardised channels have 1; the channels of three single real SLATs have 0.66 to 0.79.
 """
 
 _MAX_BYTES = 2**20
@@ -116,7 +116,7 @@ def resolve_latents(
     """Return the space of a dataset's latents after all assets have been read.
 
     `moments` holds the voxel count and moments of each asset, in an order that does not depend on
-    the number of jobs. With `standardised` ``auto``, they decide whether latents are standardised.
+    the number of jobs. If `standardised` is ``auto``, they decide whether latents are standardised.
     """
     known = [(count, one) for count, one in moments if one is not None and count]
     if not known:
@@ -159,8 +159,8 @@ def tell_alone(moments: LatentMoments, space: LatentSpace) -> bool:
     """Return whether the moments of one asset tell if its latents have been standardised.
 
     One asset's channels spread less than the dataset's, so its standardised latents may look raw.
-    A wide spread is enough to tell. If the encoder's moments are known, a standardised look is,
-    too.
+    A spread above `_WIDE_ALONE` tells; a standardised look tells if the encoder's moments are
+    known.
     """
     spread = float(np.median(moments.std))
     return spread > _WIDE_ALONE or (bool(space.mean) and look_standardised(moments, space))

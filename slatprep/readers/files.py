@@ -69,7 +69,7 @@ _DAMAGE = (
 def refusing(
     where: str | Place, fault: str, expected: str, kind: type[SlatprepError] = InputError
 ) -> Iterator[None]:
-    """Turn what libraries raise for damaged bytes into an error that gives their reason.
+    """Turn exceptions of libraries about damaged bytes into an error that gives their reason.
 
     The error is an `InputError`, or one of another `kind` with the same text.
     """

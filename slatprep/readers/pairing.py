@@ -65,7 +65,7 @@ def discover(
     Parameters
     ----------
     parameters : BuildParameters
-        Its roots, patterns and maps decide.
+        The roots, patterns and maps of the sources.
     note : callable, optional
         Gets lines for the user while archives are searched.
 

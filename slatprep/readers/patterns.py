@@ -63,7 +63,7 @@ def find_files(
     ConfigError if the pattern makes no sense or the root cannot be listed.
     """
     components = components_of(pattern)
-    # A pattern without variables needs no search. Most have none: those of files beside a grid.
+    # A pattern whose fields are all known needs no search, as for files beside a grid.
     if "*" not in (literal := fill(pattern, known)):
         if names.is_file(literal):
             yield Found(dict(known), literal)

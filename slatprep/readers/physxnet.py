@@ -1,11 +1,11 @@
 """PhysXNet and similar datasets, as voxels of PhysX-3D's toolkit or as meshes of parts.
 
 The toolkit's ``voxelize.py`` writes the centres of an object's voxels, which are TRELLIS's, to
-``voxels/<id>.ply``. Each voxel has a row of ``property/<id>2.npy``: the object's largest dimension
-[cm], the part's rank in touching, its density [g/cm^3], its movement group and that group's
-parent, eight numbers of the movement, and its kind. ``property/<id>1.npy`` holds embeddings of
-text. PhysX-3D's ``tools/1_gptanno.py`` asks for the density in g/cm^3. A part's annotation reads
-``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
+``voxels/<id>.ply``. Each voxel has a row of ``property/<id>2.npy``, which begins with the object's
+largest dimension [cm], the part's rank in touching, and its density [g/cm^3]. Its movement group,
+that group's parent, eight numbers of the movement, and its kind follow. ``property/<id>1.npy``
+holds embeddings of text. PhysX-3D's ``tools/1_gptanno.py`` asks for the density in g/cm^3. A part's
+annotation reads ``"1.2 g/cm^3"``, and the toolkit keeps the number before the blank.
 
 Objects of parts have no voxels, but a JSON with the material of each part, and a mesh per part.
 PhysXNet, PhysX-Mobility and PhysXVerse are published in this form: ``finaljson/<id>.json`` and

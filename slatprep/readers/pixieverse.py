@@ -76,8 +76,8 @@ def read_grid(
     """Read the PixieVerse side of a pair: a raw grid or a prediction, and its mask if any.
 
     A raw grid is (64, 64, 64, 4): density [kg/m^3], Young's modulus [Pa], Poisson's ratio, class
-    id. A prediction is (11, 64, 64, 64) or (4, 64, 64, 64): the same three properties, normalised
-    to [-1, 1] by Pixie's published ranges, then eight class scores or a class id.
+    id. A prediction is (11, 64, 64, 64) or (4, 64, 64, 64): the same three properties, then eight
+    class scores or a class id. Properties are normalised to [-1, 1] by Pixie's published ranges.
 
     A voxel is occupied if the (64, 64, 64) mask says so or, without a mask, if it is not
     background. It is annotated if it is occupied, of class 0 to 6, its density and Young's modulus
@@ -232,7 +232,7 @@ def _classes_of(
 
 
 def _classes_of_ids(ids: NDArray[Any], path: Place) -> NDArray[np.int8]:
-    ids = np.ascontiguousarray(ids)  # A raw grid's are every fourth value, read several times.
+    ids = np.ascontiguousarray(ids)  # In a raw grid they are strided, and they are read often.
     with np.errstate(invalid="ignore"):  # values that int8 cannot hold change
         classes = ids.astype(np.int8)
     known = (classes == ids) & (classes >= UNLABELLED) & (classes <= BACKGROUND)

@@ -1,4 +1,4 @@
-"""Values that materials can have, with their sources, and common mistakes in a dataset's values.
+"""Values that materials can have, with references, and common mistakes in a dataset's values.
 
 Mistakes concern units, columns, class ids and layouts. If undoing a mistake makes implausible
 values plausible, it was likely made.
@@ -26,7 +26,7 @@ _EXTENTS = (
     # Isotropic and not auxetic (Greaves et al., Nature Materials 10, 2011).
     (0.0, 0.5),
 )
-"""Least and largest value of any material, for each of `PROPERTIES`."""
+"""Smallest and largest value of any material, for each of `PROPERTIES`."""
 
 ENOUGH = 64
 """Number of voxels below which coordinates and moments allow no conclusion."""
@@ -42,7 +42,7 @@ def low_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
 
 
 # Bounds on E over density [Pa m^3/kg]. Carbon has the most: diamond 3.5e8, fibres 4.4e8, nanotubes
-# 8e8. If E is in GPa, any material is below 0.1; Pixie asks its labeller for 13 and more.
+# 8e8. With E in GPa, any material has less than 0.1; Pixie asks its labeller for 13 and more.
 _STIFFEST, _SOFTEST = 1e9, 0.1
 
 # Only aerogels have a density [kg/m^3] below _LIGHT. A foam of relative density r has r^2 times the
@@ -154,13 +154,13 @@ def is_usual(part: Part) -> bool:
 
 
 def is_physical(part: Part) -> bool:
-    """Return whether the reader accepts the values, as `slatprep.records.Property.physical`."""
+    """Return whether all values are physical; see `slatprep.records.Property.physical`."""
     above = all(math.isnan(one) or 0 < one < math.inf for one in (part.modulus, part.density))
     return above and not (part.ratio < 0 or part.ratio > 0.5)
 
 
 class Mistake(NamedTuple):
-    """A common mistake: its description, the setting that corrects it, and its undoing."""
+    """A common mistake: a description, the setting that corrects it, a function that undoes it."""
 
     words: str
     setting: str

@@ -61,8 +61,8 @@ def split_of(object_id: str, shares: Shares = Shares()) -> Split:
 def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[str, Split]:
     """Return the split of every object of a dataset, so that no split with a share is empty.
 
-    `split_of` decides. A split that would be empty takes the object nearest to it in [0, 1) from a
-    split that has several. This needs at least as many objects as splits.
+    `split_of` decides. A split that would be empty takes the object nearest to its middle in [0, 1)
+    from a split that has several. This needs at least as many objects as splits.
     Training and test must pass the same `object_ids`: all of the dataset, before any filter.
     """
     splits = {object_id: split_of(object_id, shares) for object_id in sorted(set(object_ids))}
@@ -157,8 +157,9 @@ def pixie_test_objects(object_ids: Iterable[str]) -> list[str]:
 def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
     """Read the ids of each split, of objects or assets.
 
-    The file is a JSON object with some of the lists ``train``, ``val`` and ``test``; or a test
-    list alone, as JSON, a one-dimensional npy of text, or an id per line. InputError otherwise.
+    The file is a JSON object with some of the lists ``train``, ``val`` and ``test``. It may also be
+    a test list alone, as JSON, a one-dimensional npy of text, or an id per line. InputError
+    otherwise.
     """
     data = read_id_file(path)
     with refusing(path, "cannot be read", _FORMS):

@@ -45,7 +45,7 @@ FOR_ALL = "Such keys hold for all objects: where this one alone is so, mend its 
 """End of a message that names a key of the dataset definition."""
 
 _SAMPLE = 1024
-"""Fewest voxels to which many are thinned: enough for medians, in a tenth of a millisecond."""
+"""Least size of a sample of many voxels: enough for medians, which take a tenth of a ms."""
 
 _SHARE = 0.5
 """Share of implausible voxels at which an asset is implausible."""

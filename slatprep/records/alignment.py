@@ -267,9 +267,9 @@ class FitFigures:
         Rise of the score by mirroring one side: above 0.025 the annotation is a mirror image of
         its object. NaN if the fit is too good for that, or if another engine found the transform.
     clear_by : float
-        Lead over the next placement, in standard errors on the same samples. Compared are
-        placements that score less than 0.03 below it (0.06 if it is contested). NaN if there is
-        none, or if another engine found the transform.
+        Smallest lead, in standard errors on the same samples, over any placement that scores less
+        than 0.03 below it (0.06 if it is contested). NaN if there is none, or if another engine
+        found the transform.
     agreement : Agreement or None
         How evenly the surfaces lie on each other; None if it was not measured.
     """

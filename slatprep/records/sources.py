@@ -117,7 +117,7 @@ def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
 class Units:
     """Units of the values in the files of a source; empty if they are not stated.
 
-    Checks whether values look like another unit's skip a property whose unit is stated.
+    The checks of plausibility do not question a stated unit.
     """
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
