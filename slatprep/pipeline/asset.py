@@ -56,7 +56,7 @@ from slatprep.store.record import AssetRecord, FailedRecord, StatusOfFailed
 from slatprep.store.record_json import faults_of
 
 _REASON, _TRACEBACK = 4_000, 100_000
-"""Largest lengths of a failure's reason and traceback, in which a stranger's names may be."""
+"""Largest lengths of a failure's reason and traceback, which may contain a stranger's names."""
 
 
 def process_asset(

@@ -1,4 +1,4 @@
-"""What exists before a build: a store, and unchanged sources.
+"""The state before a build: an existing store and unchanged sources.
 
 A first build starts without them, and can be understood without this module.
 
@@ -38,7 +38,7 @@ SHARE = 0.01
 
 @dataclass(eq=False)
 class Before:
-    """What exists before a build.
+    """The state before a build.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Before:
     wanted : Wanted
         What is asked of the build.
     previous : SourceStore or None
-        The existing store, of which `check` reads the files.
+        The existing store; `check` reads its files.
     known : mapping of str to (bytes, str)
         State and key of the assets whose sources are as the last build saw them.
     built : bool
@@ -122,7 +122,7 @@ class Before:
         write_seen(folder, bound, state, states, store.column("key"))
 
     def _bound_to(self, store: Store) -> bytes:
-        """Return a digest of this machine, a store and how sources are read: states hold for it."""
+        """Return a digest of this machine, the store and how sources are read, to bind states."""
         wanted, also = self.wanted, self.wanted.parameters.also
         slat, held = wanted.parameters.slat, wanted.declared
         roots = (

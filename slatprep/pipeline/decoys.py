@@ -40,7 +40,7 @@ EVERY = 20
 """Number of assets that a build aligns for each decoy that it aligns: 5 % more work."""
 
 ALIKE = 0.2
-"""Share of decoys called good from which objects are too much alike for decoys to tell."""
+"""Least share of decoys called good at which objects are too much alike for decoys to tell."""
 
 RATES = (0.001, 0.01, 0.05)
 """Shares of wrong assets for which the number of assets that may be kept is computed."""
@@ -60,9 +60,9 @@ _MAX_BYTES = 64 * 2**20
 class Decoy:
     """An asset's grid and another asset's SLAT, both by their ids.
 
-    `keys` are the keys of the two assets. `verdict` is that on the decoy's alignment, as for an
-    asset. `evidence` has the alignment's `slatprep.judge.evidence.FIGURES`; it is empty before the
-    decoy is aligned.
+    `keys` are the keys of the two assets. `verdict` is the verdict on the decoy's alignment, as for
+    an asset. `evidence` has the alignment's `slatprep.judge.evidence.FIGURES`; it is empty before
+    the decoy is aligned.
     """
 
     grid: str
@@ -102,7 +102,7 @@ class MeasuredErrors:
     good_wrong : float
         Number of assets called good that show another object.
     wrong_share_range, good_wrong_range : tuple of float
-        Intervals that have these two with a probability of 0.95.
+        Intervals that contain these two with a probability of 0.95.
     kept : tuple of Kept
         Assets that may be kept, for each of `RATES`.
     errors : dict of str to float

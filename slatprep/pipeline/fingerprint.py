@@ -2,9 +2,10 @@
 
 Work done by other code must be done again, but a new command, a new comment
 or a new release must not cost a day of alignment. So the fingerprint covers
-only the modules that the stages read, align, sample and judge can reach. It
-covers their statements, without comments, layout, and the docstrings of
-modules, classes and functions; the text below a constant counts.
+only the modules that the stages read, align, sample and judge can reach, and
+the JSON files of the same names. It covers statements, without comments, layout
+and the docstrings of modules, classes and functions; the text below a constant
+counts.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Notices on a dataset that a person should know, from the rows of a build."""
+"""Notices to a person about a dataset, from the rows of a build."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _BESIDE_PIXIE = 0.5
 _NAMED = 3
 
 _MOST_CLIPPED = 0.25
-"""Largest usual share of values beyond a range; usual percentiles leave out a tenth or a fifth."""
+"""Largest share of clipped values without a notice; usual percentiles clip a tenth or a fifth."""
 
 
 def nothing_usable(

@@ -58,7 +58,7 @@ class Crew:
 
 @dataclass(frozen=True)
 class BuildContext:
-    """What the tasks of a build need to know about it.
+    """The facts about a build that its tasks need.
 
     `recipe` follows from parameters and code. Finished assets go to `spool`; `previous` is the
     existing store. With `strict`, an asset's fault is raised instead of recorded.
@@ -72,7 +72,7 @@ class BuildContext:
 
 
 class Action(StrEnum):
-    """What a build does with an asset.
+    """Action of a build on an asset.
 
     ``align``: from its sources to the spool. ``reuse``: its alignment is in the existing store.
     ``resume``: an interrupted build finished it. ``refuse``: it cannot go in. ``remove``: it is in

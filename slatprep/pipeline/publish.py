@@ -216,7 +216,7 @@ PROBLEMS_LISTED = 100
 
 @dataclass(frozen=True)
 class BuildSummary:
-    """What a build did.
+    """Summary of a build.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Recipes and records: what decides an asset's row, and when it need not be done again.
+"""Recipes and records: they tell what decides an asset's row, and when it stays the same.
 
 Three things decide an asset's row: the content of its sources, the parameters
 that affect it, and the code with its libraries. A `Recipe` holds the last two.
@@ -42,7 +42,7 @@ from slatprep.store.record import (
 
 @dataclass(frozen=True)
 class Recipe:
-    """What an asset's numbers depend on besides its sources.
+    """Everything besides its sources on which an asset's numbers depend.
 
     `parameters` are those that affect an asset, `versions` those of the libraries that make the
     numbers, and `code` is the fingerprint of the code.
@@ -88,7 +88,7 @@ def recipe_of(parameters: BuildParameters) -> Recipe:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked of a build.
+    """The request to a build: its parameters, and everything that follows from them alone.
 
     Attributes
     ----------

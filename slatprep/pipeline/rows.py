@@ -1,6 +1,6 @@
 """The rows of the next store, whose arrays lie in the spool or in another store.
 
-The other store is the existing store, or a store that is joined or chosen from.
+The other store is the existing store, or one from which assets are chosen or joined.
 """
 
 from __future__ import annotations

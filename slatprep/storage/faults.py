@@ -1,7 +1,7 @@
 """A seam at which tests stop or kill a build, or make it fail.
 
-Each step of a build calls `reached` with its name, and the asset or file that it concerns. Where
-the environment variable ``SLATPREP_FAULTS`` is ``module:function``, `reached` calls that function
+Each step of a build calls `reached` with its name, and the asset or file that it concerns. If the
+environment variable ``SLATPREP_FAULTS`` is ``module:function``, `reached` calls that function
 with both. The function may raise an error or end the process. Without the variable nothing is
 called. Worker processes inherit the variable, so the module must be importable there too.
 

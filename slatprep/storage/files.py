@@ -1,4 +1,4 @@
-"""Files of the local disk: read by ranges, list, hash and name them.
+"""Read, list, hash and name files of the local disk.
 
 A listing of a disk asks for names one by one. An object store has no folders: one request lists a
 thousand names, and a request for a single name costs as much.
@@ -194,7 +194,7 @@ def open_digest(file: IO[bytes] | LocalFile) -> str:
 
 
 class Listing:
-    """Names below a folder of the local disk, up to date except that the folder is listed once.
+    """Names below a folder of the local disk, up to date except that its top is listed only once.
 
     Names are relative to the folder, with forward slashes.
     """

@@ -57,7 +57,7 @@ class StoredParameters:
 
 @dataclass(frozen=True)
 class StoredBuild:
-    """What made a store: parameters, versions, and the name of the dataset."""
+    """Origin of a store: parameters, versions, and the name of the dataset."""
 
     parameters: StoredParameters
     versions: dict[str, str]

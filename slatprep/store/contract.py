@@ -100,7 +100,7 @@ def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iter
 
 
 def dimension_sizes(metadata: Mapping[str, Any]) -> dict[str, int]:
-    """Return the size of every dimension, from the array that defines it; StoreError if none."""
+    """Return the size of every dimension, from the array that defines it; else StoreError."""
     sizes = dict(FIXED_SIZES)
     for name, dimension, limit in (
         ("asset/id", "asset", MAX_ASSETS),

@@ -126,7 +126,7 @@ class StoredAsset:
 
     @cached_property
     def cells(self) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Cells of the 64^3 grid that the asset occupies, and a voxel of each; `shown_in_cells`."""
+        """Occupied cells of the 64^3 grid, and a voxel of each; see `shown_in_cells`."""
         return shown_in_cells(self.coords, self.store.contents.latents.resolution)
 
     @cached_property

@@ -174,7 +174,7 @@ StatusOfFailed = Literal[Status.FAILED, Status.SKIPPED]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FailedRecord:
-    """Why an asset is not in the store."""
+    """Record of an asset that is not in the store, with the reason."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = _CHECKED
 

@@ -128,8 +128,8 @@ def manifests_of(store: Place) -> Place:
 def found_manifests(store: Place, build: str) -> Place | None:
     """Return the folder of a store's records, or None if there is none.
 
-    It is the folder beside the store, or else the one of `make align`, that records the store's
-    `build`; if neither does, the folder beside the store. StoreError if that cannot be reached.
+    The folder beside the store is taken, or that of `make align`, if it has the record of `build`.
+    If neither has it, it is the folder beside the store. StoreError if that cannot be reached.
     """
     named = store.parent.parent if is_version(store) else store
     folder = manifests_of(store)

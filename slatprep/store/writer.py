@@ -191,7 +191,7 @@ def finish_store(
 def _write_coordinates(root: Any, properties: Sequence[str]) -> None:
     """Write coordinates of dimensions, so that xarray can name rows, columns and places.
 
-    xarray makes an array with its dimension's name an index:
+    In xarray an array with the name of its dimension becomes an index:
     ``xarray.open_zarr(store, group="voxel").sel(property="density")`` works. For Zarr itself the
     array has no meaning.
     """
