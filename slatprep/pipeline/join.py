@@ -103,7 +103,7 @@ def concat_stores(
 
     Stores with the same ranges are joined byte by byte. If each store has the
     ranges of its own dataset, properties are converted to ranges that span all
-    of them, through SI units in float32, with errors up to 1e-6 of a range.
+    of them. This goes through SI units in float32 and is right to 1e-6 of a range.
 
     Parameters
     ----------
