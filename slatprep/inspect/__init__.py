@@ -1,1 +1,1 @@
-"""What people look at: checks, overviews, pictures, the report, verification."""
+"""Check, compare, verify and show a store: overviews, statistics, pictures, the report."""

@@ -1,4 +1,4 @@
-"""Whether an asset's alignment is good, recomputed from the store alone."""
+"""Recompute from the store alone whether an asset's alignment is good."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import StoredRecords
 
 QUALITY_TOLERANCE = 1e-3
-"""Largest difference of a recomputed figure: a voxel at the radius may round either way."""
+"""Largest allowed difference of a recomputed figure: a voxel at the radius may round either way."""
 
 TOLERANCES = {
     "voxel/valid": 0.0,
@@ -27,14 +27,14 @@ TOLERANCES = {
     "voxel/properties": 1e-5,
     "voxel/distance": 1e-3,
 }
-"""Largest difference between an array and its recomputed values, by name.
+"""Largest allowed difference between an array and its recomputed values, by name.
 
 Properties are normalised; converting float32 to SI and back costs digits. Distances are in
 voxels.
 """
 
 FITNESS = ("fitness", "fitness_backward")
-"""Shares of either side's boundary that are near the other's."""
+"""Names of the shares of each side's boundary that lie near the other side's boundary."""
 
 _QUALITY = ("fitness", "inlier_rmse", "fitness_backward", "inlier_rmse_backward", "overlap")
 
@@ -44,15 +44,15 @@ LIMITS = {
     "valid_share": (">=", operator.ge, THRESHOLDS.good_valid_share),
     "ambiguity": ("<=", operator.le, THRESHOLDS.good_ambiguity),
 }
-"""What a figure is in a good alignment."""
+"""Threshold of each figure in a good alignment: its sign, comparison and limit."""
 
 
 @dataclass(frozen=True)
 class Figure:
     """One number of a check: the `value` computed now and the `stored` one.
 
-    `limit` is their largest allowed difference. One that is `settled` has no threshold: something
-    chose among the ties.
+    `limit` is their largest allowed difference. A `settled` figure has no threshold, because
+    consensus or a witness chose among the ties.
     """
 
     name: str
@@ -99,14 +99,14 @@ class AlignmentCheck:
     stored_verdict : str
         The verdict that the store holds.
     figures : tuple of Figure
-        Every number, computed now and as stored. Ambiguity and margin come from the store: it
-        does not hold the placements that they follow from.
+        Every number, computed now and as stored. Ambiguity and margin come from the store,
+        because it does not hold the placements that give them.
     transform : ndarray of float64, shape (4, 4)
         PixieVerse frame to SLAT frame.
     radius : float
         Distance [voxel] up to which fitness counts a voxel as near the other side.
     unusual : tuple of str
-        What is unusual of its values, masks, places or latents.
+        What is unusual about its values, masks, places or latents.
     """
 
     asset_id: str
@@ -135,7 +135,7 @@ class AlignmentCheck:
                 f"confidence {sure:.1%}: the two sides show the same object with a probability of "
                 f"{same:.1%}, and its placement is right with {placed:.1%}"
             )
-        else:  # Those probabilities hold for the stored fit alone: the verdict rests on this one.
+        else:  # The probabilities hold for the stored fit alone; the verdict uses the fitness.
             forward, backward = map(self.value, FITNESS)
             rests = (
                 f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary "
@@ -155,7 +155,7 @@ class AlignmentCheck:
 
 
 def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
-    """Recompute an alignment's quality, and the annotation it gives, from the store alone.
+    """Recompute an alignment's quality and annotation from the store alone.
 
     Raises StoreError if the store has no such asset.
     """
@@ -165,7 +165,7 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     valid_share, differs = recompute_annotation(asset)
     record = StoredRecords(store).read(asset.index)
     alignment, columns = record.alignment, asset.columns
-    # As the columns have it: they are what is looked at.
+    # The columns are checked, so their values replace those of the record.
     judgement = replace(
         record.judgement,
         ambiguity=replace(record.judgement.ambiguity, material_share=float(columns["ambiguity"])),
@@ -218,11 +218,12 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
     """Sample an asset's annotation again from the stored grid and compare it with the store.
 
     Returns the share of SLAT voxels that get an annotation now, and the difference (N,) of each
-    voxel by the arrays of `TOLERANCES`: 1 where valid or material changed, else the largest one. As
-    the stored grid is one annotation, labels merged of several are compared only where all agree.
+    voxel by the arrays of `TOLERANCES`. The difference of valid and material is 1 if they changed;
+    that of properties is the largest over the properties. The stored grid is one annotation, so
+    labels merged from several are compared only at voxels where all agree.
     """
     parameters = asset.store.about.build.parameters.sample
-    # What is looked up is copied, so it need not be brought to SI units and back.
+    # The lookup only copies properties, so they can stay normalised.
     annotation = sample(asset.normalised_field, asset.place, parameters)
     changes = functools.reduce(np.maximum, np.abs(annotation.properties - asset.properties).T)
     both = annotation.valid & asset.valid
@@ -244,17 +245,17 @@ def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[n
 def choose_assets(
     store: Store, asset_ids: Iterable[str] = (), worst: int = 0, ambiguous: bool = False
 ) -> list[str]:
-    """Choose assets to check, each once: those named, then the worst, then the ambiguous.
+    """Choose assets to check, each once: the named assets, then the worst, then the ambiguous.
 
-    The `worst` follow by verdict, failed first, then by confidence, then by the lower fitness;
-    `ambiguous` takes all above the threshold of ambiguity, the most ambiguous first.
+    The `worst` are sorted by verdict (failed first), then confidence, then the lower of the two
+    fitness values. `ambiguous` adds all assets above the threshold, the most ambiguous first.
     """
     rows = [store.match(asset_id) for asset_id in asset_ids]
     if worst:
         places = {Verdict.FAILED: 0, Verdict.DOUBTFUL: 1, Verdict.GOOD: 2}
         rank = [places.get(verdict, -1) for verdict in store.column("verdict")]
         fitness = np.minimum(*map(store.column, FITNESS))
-        # Assets without a number come first.
+        # Assets with NaN come first.
         confidence, fitness = (
             np.nan_to_num(figure, nan=-1.0) for figure in (store.column("confidence"), fitness)
         )

@@ -1,4 +1,4 @@
-"""The differences between two stores: their settings, and the changes of each asset."""
+"""Compare two stores: their settings, and the changes of each asset."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
 
 _ROUNDING = 1e-6
-"""Share of a range; rounding to float32 in two normalisations differs by less."""
+"""Smallest change that counts, as a share of a range: above the rounding of two normalisations."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """An attribute of the stores' roots that differs; None where a store does not have it."""
+    """A root attribute that differs between two stores; None if a store does not have it."""
 
     name: str
     a: object
@@ -38,16 +38,16 @@ class Setting:
 
 @dataclass(frozen=True)
 class PropertyChange:
-    """How a property changed over voxels that are valid in both stores.
+    """Change of a property over voxels that are valid in both stores.
 
     Attributes
     ----------
     voxels, changed : int
-        Number of those voxels, and of those whose value differs.
+        Number of voxels valid in both, and of voxels whose value differs.
     mean, most : float
         Mean and largest absolute change, in the SI unit.
     log10 : float or None
-        Mean absolute change of log10; None unless both stores normalise it so.
+        Mean absolute change of log10; None unless both stores normalise the property by log10.
     """
 
     voxels: int
@@ -66,23 +66,23 @@ class AssetChange:
     asset_id : str
         Its id.
     what : tuple of str
-        What differs, in words: ``sources``, ``verdict``, ``placement``, ``voxels``,
-        ``labels``, ``properties``, ``latents``, ``columns``; empty if nothing does.
+        Words for the differences: ``sources``, ``verdict``, ``placement``, ``voxels``,
+        ``labels``, ``properties``, ``latents``, ``columns``; empty if there are none.
     verdicts : tuple of str
-        In the two stores.
+        Verdicts in the two stores.
     sources : tuple of str
         Roles of the source files whose content differs.
     columns : tuple of str
         Other arrays that differ, such as ``asset/fitness`` and ``voxel/confidence``.
     moved : float
-        Mean distance, in voxels of the PixieVerse frame, between the two places where a
-        SLAT voxel is looked up; from the transforms alone if the SLATs have different voxels.
+        Mean distance, in voxels of the PixieVerse frame, between the two places of a SLAT
+        voxel; from the transforms alone if the SLATs have different voxels.
     voxels, unmatched : int
         Number of SLAT voxels in both stores, and in only one.
     labels : int
-        Voxels in both stores whose class differs, or that are valid in only one.
+        Number of voxels in both stores whose class differs, or that are valid in only one.
     properties : dict of str to PropertyChange
-        By name, of the properties in both stores.
+        Changes of the properties that both stores have, by name.
     """
 
     asset_id: str
@@ -106,25 +106,25 @@ class StoreDifference:
     a, b : Place
         The stores.
     same : bool
-        Whether there are none.
+        Whether there are no differences.
     settings : tuple of Setting
         Attributes that differ: format, ranges, parameters, versions, the digest of the records.
     only_a, only_b : tuple of str
         Ids of assets in only one of the stores.
     assets, changed : int
-        Number of assets in both, and of those that changed.
+        Number of assets in both, and of assets that changed.
     what : dict of str to int
-        Number of changed assets by what differs, see `AssetChange`.
+        Number of changed assets by the words of `AssetChange.what`.
     verdicts : dict of str to int
-        Changes of the verdict, such as ``good > failed``.
+        Number of assets by change of verdict, such as ``good > failed``.
     moved, moved_most : float
         Median and maximum of `AssetChange.moved` over the assets that moved; NaN if none did.
     voxels, labels : int
-        Number of SLAT voxels in both stores, and of those whose class differs.
+        Number of SLAT voxels in both stores, and sum of `AssetChange.labels`.
     properties : dict of str to PropertyChange
-        Over the voxels of all assets.
+        Changes over the voxels of all assets, by name.
     worst : tuple of AssetChange
-        Assets that changed: those with most changed labels first, then those that moved most.
+        Changed assets, sorted by the share of changed labels and voxels, then by distance moved.
     """
 
     a: Place
@@ -155,8 +155,8 @@ def compare_stores(
 ) -> StoreDifference:
     """Return the differences between two stores.
 
-    Each asset is read once from either store, without ``grid/*``: the digests of their sources
-    stand for those.
+    Each asset is read once from both stores, without ``grid/*``: the digests of the sources
+    show whether the grids differ.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ class _Sum:
         self.properties: dict[str, PropertyChange] = {}
 
     def of(self, changes: Iterator[AssetChange]) -> Iterator[AssetChange]:
-        """Add all changes to the totals, and yield those of assets that changed."""
+        """Add all changes to the totals, and yield the changes that are not empty."""
         for change in changes:
             self.voxels += change.voxels
             self.labels += change.labels
@@ -253,7 +253,7 @@ def _how_much(change: AssetChange) -> tuple[float, ...]:
 
 
 def _settings(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> Iterator[Setting]:
-    """Yield the entries of two JSON objects that differ, each by its path with dots."""
+    """Yield the entries that differ between two JSON objects, named by their dotted paths."""
     for key in sorted(a.keys() | b.keys()):
         one, other, name = a.get(key), b.get(key), f"{above}{key}"
         if isinstance(one, dict) and isinstance(other, dict):
@@ -289,7 +289,7 @@ def _changes(
 
 
 def _unequal(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which rows of two arrays differ; not-a-number is equal to itself."""
+    """Return which rows of two arrays differ; NaN equals NaN."""
     if a.shape[1:] != b.shape[1:]:
         return np.ones(len(a), bool)
     other = (a != b) & ((a == a) | (b == b))
@@ -309,14 +309,14 @@ def _compare(
     verdicts: tuple[str, str],
     columns: Sequence[str],
 ) -> AssetChange:
-    """Compare an asset, in a worker; its verdicts and the `columns` that differ are known."""
+    """Compare an asset, in a worker, given its verdicts and the `columns` that differ."""
     records = a.records.read(rows[0]), b.records.read(rows[1])
     digests = [{(one.role, one.sha256) for one in record.sources} for record in records]
     roles = {role for role, _ in digests[0] ^ digests[1]}
     one, other = a.read(rows[0], VOXEL_COLUMNS), b.read(rows[1], VOXEL_COLUMNS)
     coords = one.pop("coords"), other.pop("coords")
     unmatched, moved = 0, 0.0
-    # Voxels of another grid are others.
+    # Voxels of grids with different resolutions never match.
     sides = [store.contents.latents.resolution for store in (a, b)]
     order = sides[0] == sides[1] and np.array_equal(*coords)
     if not order:

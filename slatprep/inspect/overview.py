@@ -1,4 +1,4 @@
-"""The contents and quality of a store, for one screen, and its assets in a list."""
+"""Summarise a store's contents and quality for one screen, and list its assets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from slatprep.store import Store
 from slatprep.store.records import StoredRecords
 
 UNKNOWN = "(unknown)"
-"""Name of the group of assets whose category is not known."""
+"""Name of the group of assets whose category is unknown."""
 
 _MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
             "overlap")  # fmt: skip
@@ -29,8 +29,8 @@ class GroupOverview:
 
     ``verdicts`` counts the assets by verdict. Confidence, expected accuracy, fitness, rmse [voxel]
     and overlap are medians over the assets; ``valid_share`` is over all their voxels. ``ambiguous``
-    counts assets above the threshold of ambiguity. ``unphysical`` counts PixieVerse voxels left out
-    because no material has their properties.
+    counts assets above the threshold of ambiguity. ``unphysical`` counts PixieVerse voxels without
+    an annotation because no material has their properties.
     """
 
     name: str
@@ -52,8 +52,8 @@ class GroupOverview:
 class StoreOverview:
     """The contents of a store.
 
-    ``total`` is over all assets, ``categories`` has an entry for each category in alphabetical
-    order; ``files`` is the number of the store's files, ``size`` their sum in bytes.
+    ``total`` is over all assets; ``categories`` has an entry for each category, in alphabetical
+    order. ``files`` is the number of the store's files, ``size`` their total size in bytes.
     """
 
     store: Place
@@ -115,7 +115,7 @@ def _counts(values: Sequence[Any] | NDArray[Any]) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class ListedAsset:
-    """One line of the list; ``reasons`` say why the verdict is not ``good``."""
+    """One asset of the list; ``reasons`` say why the verdict is not ``good``."""
 
     asset_id: str
     category: str
@@ -147,15 +147,15 @@ def list_assets(
 ) -> Iterator[ListedAsset]:
     """Yield the assets of a store, sorted by id.
 
-    They have one of `verdicts` and `categories`, where given, and at most `max_confidence`.
-    StoreError if the store, or the record of an asset that is not good, cannot be read.
+    If given, `verdicts`, `categories` and `max_confidence` choose the assets. Raises StoreError if
+    the store, or the record of an asset that is not good, cannot be read.
     """
     table, records, ids = store.table(), StoredRecords(store), store.ids
     for row in sorted(rows_chosen(store, verdicts, categories), key=ids.__getitem__):
         verdict, confidence = str(table["verdict"][row]), float(table["confidence"][row])
         if max_confidence is not None and not confidence <= max_confidence:
             continue
-        good = verdict == Verdict.GOOD  # A record takes a millisecond to read, and most are good.
+        good = verdict == Verdict.GOOD  # Needs no record, which takes a millisecond to read.
         yield ListedAsset(
             ids[row],
             str(table["category"][row]),

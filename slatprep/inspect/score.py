@@ -1,11 +1,10 @@
 """Score a store against known truth, as demo data has it.
 
-The truth of an asset is ``<truth_dir>/<asset id>.npz`` with ``transform``
-(4, 4), ``material`` (N,), ``name``, ``level`` and ``symmetric``, and, where the two
-shapes differ, ``places`` (N, 3): where each SLAT voxel truly lies in the PixieVerse
-frame. There ``transform`` is the similarity that comes nearest to the places. Of a store
-without classes voxels are right whose properties are those of ``properties`` (N, P), a
-column for each name in ``columns`` (P,).
+The truth of an asset is ``<truth_dir>/<asset id>.npz`` with ``transform`` (4, 4), ``material``
+(N,), ``name``, ``level`` and ``symmetric``. If the two shapes differ, it also has ``places``
+(N, 3), the true place of each SLAT voxel in the PixieVerse frame; ``transform`` is then the
+similarity nearest to these places. In a store without classes, a voxel is right if its
+properties equal the true ``properties`` (N, P), with a column for each name in ``columns`` (P,).
 """
 
 from __future__ import annotations
@@ -32,17 +31,16 @@ from slatprep.store import StoredAsset, open_store
 from slatprep.workers import Progress
 
 SUCCESS_DISPLACEMENT = 1.5
-"""An asset is placed right where its mean displacement [voxel] is less than this above the
-least that a similarity can have."""
+"""Largest mean displacement [voxel] of a right placement, above that of the true similarity."""
 
 SAME_VALUE = 0.01
-"""Share of a property's true value by which one that is the same may be off."""
+"""Largest relative difference at which a property counts as equal to its true value."""
 
 MOST_VALUES = 255
-"""True rows of properties that an asset may have, each other than the others."""
+"""Largest number of distinct rows of true properties in an asset."""
 
 ANSWERABLE_DISTANCE = 2.0
-"""A SLAT voxel has a true answer where an annotation lies so near its true place [voxel]."""
+"""Largest distance [voxel] from a true place to an annotated voxel at which labels are scored."""
 
 _TRUTH = {
     "transform": ArraySpec(((4, 4),), "f"),
@@ -60,10 +58,10 @@ _VALUES = {
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of one asset: transform (4, 4), class of each SLAT voxel (N,), and names.
+    """The truth of one asset: transform (4, 4), class of each SLAT voxel (N,), and names.
 
     ``places`` (N, 3) are the true places of the SLAT voxels in the PixieVerse
-    frame's unit cube; None where the inverse transform leads to them.
+    frame's unit cube; None if the inverse transform gives them.
     """
 
     path: Path
@@ -77,26 +75,26 @@ class Truth:
 
 @dataclass(frozen=True)
 class TruthScore:
-    """How one asset of a store compares with its truth.
+    """Comparison of one asset of a store with its truth.
 
     Attributes
     ----------
     asset_id, name, level, symmetric
         As the truth states them.
     displacement : float
-        Mean distance [voxel] over the SLAT voxels between where they were
-        looked up in the PixieVerse frame and where they truly lie.
+        Mean distance [voxel] between the stored and the true place of a SLAT voxel
+        in the PixieVerse frame.
     label_accuracy : float
-        Share of the answerable voxels whose class is right (of a store without
-        classes, all of whose properties are); one that is not valid is wrong.
+        Share of the voxels within `ANSWERABLE_DISTANCE` whose class is right; in a store
+        without classes, whose properties are all right. A voxel that is not valid is wrong.
     truth_own : float
-        The same share for the annotated voxel nearest to each true place: what
-        is left to lose by the lookup alone.
+        The same share if each voxel takes the class of the annotated voxel nearest to its
+        true place: the accuracy that a perfect alignment reaches.
     valid_share : float
         Share of the SLAT voxels that are valid.
     similarity_displacement, similarity_accuracy : float
-        Displacement and share of right classes of the truth's transform: of the
-        similarity that comes nearest to the true places.
+        Displacement, and share of right classes, of the truth's transform: the similarity
+        nearest to the true places.
     """
 
     asset_id: str
@@ -112,7 +110,7 @@ class TruthScore:
 
     @property
     def placed(self) -> bool:
-        """Whether the placement is right, as far as a similarity could make it so."""
+        """Whether the placement is right, compared with the best similarity."""
         return self.displacement < self.similarity_displacement + SUCCESS_DISPLACEMENT
 
 
@@ -120,7 +118,7 @@ class TruthScore:
 class LevelScore:
     """The non-symmetric assets of one level: shares, means and medians of their scores.
 
-    Displacements are medians (``displacement_p90``: the 90th percentile), all else
+    Displacements are medians (``displacement_p90``: the 90th percentile), other numbers
     are means; ``success`` is the share of assets that are placed right.
     """
 
@@ -138,7 +136,7 @@ class LevelScore:
 
 @dataclass(frozen=True)
 class TruthReport:
-    """Scores of a store: one an asset, one a level; `missing` has a truth but no row."""
+    """Scores of a store by asset and by level; `missing` are ids with a truth but no row."""
 
     assets: tuple[TruthScore, ...]
     levels: tuple[LevelScore, ...]
@@ -148,10 +146,10 @@ class TruthReport:
 def score_against_truth(
     store: Place, truth_dir: Path, progress: Progress | None = None
 ) -> TruthReport:
-    """Compare every asset of a store that has a truth in the folder with it.
+    """Compare every asset of a store with its truth in the folder, if it has one.
 
-    InputError if there is no truth in the folder, none of its truths is of an asset of the store,
-    or a truth does not fit its asset.
+    Raises InputError if the folder has no truth, none for an asset of the store, or a truth that
+    does not fit its asset.
     """
     truths = {path.stem: path for path in sorted(truth_dir.glob("*.npz"))}
     if not truths:
@@ -171,7 +169,7 @@ def score_against_truth(
 
 
 def summarise(scores: Sequence[TruthScore]) -> tuple[LevelScore, ...]:
-    """Return the score of each level over its assets that have one right placement only."""
+    """Return the score of each level over its assets that are not symmetric."""
     counted = [score for score in scores if not score.symmetric]
     return tuple(
         _summarise_level(level, [score for score in counted if score.level == level])
@@ -215,7 +213,7 @@ def _score_asset(asset: StoredAsset, path: Path) -> TruthScore:
 
 
 def _true_values(path: Path, count: int) -> tuple[tuple[str, ...], NDArray[np.floating[Any]]]:
-    """Return the true properties (N, P) of SLAT voxels, and their names."""
+    """Return the names of the true properties, and their values (N, P) at the SLAT voxels."""
     data, _ = load_source(path, path.parent, "truth")
     arrays = npz_arrays(data, path, _VALUES)
     names, values = tuple(map(str, arrays["columns"])), arrays["properties"]
@@ -225,7 +223,7 @@ def _true_values(path: Path, count: int) -> tuple[tuple[str, ...], NDArray[np.fl
 
 
 def _row_of(values: NDArray[np.float32], known: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    """Return which of the known rows each row of values (N, P) is; as many as there are if none."""
+    """Return the index (N,) of the known row that equals each row of values; len(known) if none."""
     found = np.full(len(values), len(known), np.uint8)
     for number, row in enumerate(known):
         found[np.isclose(values, row, rtol=SAME_VALUE, atol=1e-6).all(axis=1)] = number
@@ -241,7 +239,7 @@ def compare_with_truth(
 ) -> TruthScore:
     """Compare one asset's places and labels with its truth.
 
-    InputError if the truth does not have one class and one place for each voxel.
+    Raises InputError if the truth does not have one class and one place for each voxel.
     """
     from scipy.spatial import cKDTree
 
@@ -289,7 +287,7 @@ def _share(flags: NDArray[np.bool_]) -> float:
 
 
 def read_truth(path: Path) -> Truth:
-    """Read one asset's truth; InputError if the file cannot be read, or its numbers are none."""
+    """Read one asset's truth; raise InputError if the file is unreadable or holds bad numbers."""
     try:
         data, _ = load_source(path, path.parent, "truth")
         arrays = npz_arrays(data, path, _TRUTH)

@@ -20,10 +20,10 @@ from slatprep.workers import Progress
 from slatprep.workers.local import run_in_order
 
 BINS = 4096
-"""Bins over a property's range from which quantiles are computed."""
+"""Number of bins over a property's range from which quantiles are computed."""
 
 DRAWN_BINS = 64
-"""Bins of the histograms in the result."""
+"""Number of bins of the histograms in the result."""
 
 _TASK_ASSETS = 32
 
@@ -31,7 +31,7 @@ QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 QUANTILE_NAMES = tuple(f"{100 * quantile:g}%" for quantile in QUANTILES)
 
 Weight = Literal["voxel", "asset"]
-"""What has a weight of 1: each voxel, or all voxels of one side of an asset together."""
+"""Unit that has a weight of 1: each voxel, or all voxels of one side of an asset together."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Distribution:
 
 @dataclass(frozen=True)
 class PropertyStatistics:
-    """One property in its SI unit, and its log10 where the store normalises it so."""
+    """One property in its SI unit, and its log10 if the store normalises it by log10."""
 
     unit: str
     si: Distribution
@@ -56,21 +56,22 @@ class PropertyStatistics:
 
 @dataclass(frozen=True)
 class SideStatistics:
-    """Some voxels of one side: the PixieVerse fields, or the SLATs.
+    """Statistics of some voxels of one side: the PixieVerse fields, or the SLATs.
 
     Attributes
     ----------
     assets, voxels : int
-        Number of these voxels (of fields: the occupied ones), and of assets that have any.
+        Number of assets that have any of these voxels, and of the voxels; only occupied voxels
+        of a field count.
     share : float
-        Their share of the weight of all voxels on this side.
+        Share of these voxels in the weight of all voxels on this side.
     unannotated : float
         Share of their weight without an annotation: voxels of fields without a
         class, voxels of SLATs that are not valid.
     classes : dict of str to float
         Share of each class among the annotated voxels.
     properties : dict of str to PropertyStatistics
-        By name, over the annotated voxels.
+        Statistics of each property over the annotated voxels, by name.
     """
 
     assets: int
@@ -83,10 +84,10 @@ class SideStatistics:
 
 @dataclass(frozen=True)
 class GroupStatistics:
-    """All voxels, those of a class, or those of the assets of a category.
+    """Statistics of all voxels, of a class, or of the assets of a category.
 
     ``field`` is before the lookup, ``slat`` after it. ``verdicts`` counts the assets by verdict; it
-    is empty for a class, because the voxels of an asset can have several.
+    is empty for a class, because an asset can have voxels of several classes.
     """
 
     by: Literal["all", "class", "category"]
@@ -98,7 +99,7 @@ class GroupStatistics:
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """Weights of one property by class (C, bins); `edges` (bins + 1,) are of log10 if `log10`."""
+    """Weights of one property by class (C, bins); `edges` (bins + 1,) are log10 if `log10`."""
 
     name: str
     unit: str
@@ -127,22 +128,22 @@ class StoreStatistics:
     store : Place
         The store.
     assets, assets_chosen : int
-        Number of assets in the store, and of those that pass the filters.
+        Number of assets in the store, and of assets that pass the filters.
     weight : str
-        What has a weight of 1, ``voxel`` or ``asset``.
+        Unit that has a weight of 1, ``voxel`` or ``asset``.
     quantile_error : dict of str to float
-        Largest error of a quantile of each property: the width of a bin, in log10 where the
-        property is normalised so, else in its SI unit. A quantile is the mean of the values
-        in its bin, so it is exact where they are all equal. All other numbers are exact up to
-        rounding.
+        Largest error of a quantile of each property: the width of a bin, in log10 if the
+        property is normalised by log10, else in its SI unit. A quantile is the mean of the
+        values in its bin, so it is exact if they are all equal. All other numbers are exact up
+        to rounding.
     total : GroupStatistics
-        All chosen assets.
+        Statistics of all chosen assets.
     classes, categories : tuple of GroupStatistics
-        By class, in the store's order, and by category, in alphabetical order.
+        Statistics by class, in the store's order, and by category, in alphabetical order.
     histograms : tuple of Histogram
-        One for each property, over its range.
+        Histogram of each property, over its range.
     joint : JointHistogram or None
-        Of the first two properties; None if the store has only one.
+        Joint histogram of the first two properties; None if the store has only one.
     """
 
     store: Place
@@ -169,14 +170,14 @@ def store_statistics(
     """Return the statistics of a store's voxels by class, category and property.
 
     Each chosen asset is read once, with its grid. Memory does not grow with the number of
-    assets, and with the number of categories only by the size of the result.
+    assets; with the number of categories only the result grows.
 
     Parameters
     ----------
     store : Store, str or Place
         An open store, or its path or URL.
     verdicts, categories : str or collection of str
-        Only assets with one of these; empty takes all.
+        Take only assets with one of these; empty takes all.
     weight : str
         ``voxel``: each voxel has weight 1. ``asset``: the occupied voxels of a
         field have weight 1 together, and so have the voxels of a SLAT.
@@ -188,8 +189,8 @@ def store_statistics(
     Returns
     -------
     StoreStatistics
-        Figures over no voxels are NaN. A quantile q is the smallest value that at least the
-        share q of the weight does not exceed (numpy's ``inverted_cdf``), up to
+        Statistics; NaN for a group without voxels. A quantile q is the smallest value that at
+        least the share q of the weight does not exceed (numpy's ``inverted_cdf``), up to
         `StoreStatistics.quantile_error`.
 
     Raises
@@ -204,7 +205,7 @@ def store_statistics(
     rows = rows_chosen(store, verdicts, categories)
     column = [str(category) for category in store.column("category")]
     verdict_of = [str(verdict) for verdict in store.column("verdict")]
-    # Ordered by category, so that only one category's tally is in memory at a time.
+    # Sort by category, so that only one category's tally is in memory at a time.
     rows.sort(key=lambda row: (column[row], row))
     portions = [
         own[start : start + _TASK_ASSETS]
@@ -248,7 +249,7 @@ def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
     store, names = open_store(path), ("material", "properties")
     total = no_tally(store, BINS)
     for row in rows:
-        # Not `store.asset`: it reads all columns of asset/*, which takes long in a large store.
+        # `store.asset` would read all columns of asset/*, which takes long in a large store.
         field = (store.read_rows(f"grid/{name}", row, row + 1)[0] for name in names)
         slat = store.read(row, names).values()
         total += tally(store, field, slat, BINS, by_asset)
@@ -276,7 +277,7 @@ def _group(
 def _side(
     store: Store, counts: Tally, side: int, index: int | None, assets: int | None
 ) -> SideStatistics:
-    """Summarise one side; the last entry of a tally is of voxels without an annotation."""
+    """Summarise one side; the last entry of a tally counts voxels without an annotation."""
     chosen = slice(None) if index is None else slice(index, index + 1)
     annotated = slice(counts.weights.shape[-1] - 1) if index is None else chosen
     own = counts.weights[side, annotated]

@@ -2,7 +2,7 @@
 
 Tallies of several assets are added with ``+``. Moments are merged by the pairwise update of
 Chan, Golub and LeVeque ("Updating Formulae and a Pairwise Algorithm for Computing Sample
-Variances", 1979), which loses no digits however many assets are added.
+Variances", 1979), which stays accurate for any number of assets.
 """
 
 from __future__ import annotations
@@ -18,40 +18,40 @@ from slatprep.normalize import denormalize_properties
 from slatprep.store import Store
 
 JOINT_BINS = 64
-"""Bins of either axis of the joint histogram, over [-1, 1]."""
+"""Number of bins of each axis of the joint histogram, over [-1, 1]."""
 
 Voxels = Iterable[NDArray[Any]]
 """Classes and normalised properties of voxels."""
 
 
 SIDES = ("field", "slat")
-"""The PixieVerse field, before the lookup, and the SLAT's voxels, after it."""
+"""Names of the sides: the PixieVerse field before the lookup, the SLAT's voxels after it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tally:
-    """Sums over the voxels of an asset, or of many; the first axis of all has the `SIDES`.
+    """Sums over the voxels of one or more assets; the first axis of every array is `SIDES`.
 
-    C is the number of labels, P that of properties.
+    C is the number of labels, P the number of properties.
 
     Attributes
     ----------
     assets, voxels : ndarray of int64, shape (2, C + 1)
-        By class, the number of voxels and of assets that have any; the last entry is for
-        voxels without an annotation.
+        Number of assets that have voxels of each class, and of these voxels; the last entry
+        is for voxels without an annotation.
     weights : ndarray of float64, shape (2, C + 1)
-        Total weight of those voxels.
+        Total weight of these voxels.
     histogram : ndarray of float64, shape (2, P, C, bins)
         Weight by property, class and bin of the normalised value, over [-1, 1].
     sums : ndarray of float64, shape (2, P, C, bins)
-        Weighted sum of the normalised values in each bin, whose mean is exact where all are equal.
+        Weighted sum of the normalised values in each bin: the bin's mean is exact if all are equal.
     joint : ndarray of float64, shape (2, JOINT_BINS, JOINT_BINS)
         Weight by bins of the first two properties; zero if there is only one.
     mean, squares : ndarray of float64, shape (2, 2, P, C)
         Weighted mean, and weighted sum of squared differences from it, of the
-        normalised values and of those in SI units.
+        normalised values and of the values in SI units.
     least, most : ndarray of float64, shape (2, P, C)
-        Smallest and largest normalised value; inf and -inf where there are no voxels.
+        Smallest and largest normalised value; inf and -inf if there are no voxels.
     """
 
     assets: NDArray[np.int64]
@@ -84,7 +84,7 @@ def pooled(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Merge means and sums of squared differences, shaped like `weights`, along an axis.
 
-    Both are 0 where all weights are 0.
+    Both results are 0 where all weights are 0.
     """
     total = weights.sum(axis=axis, keepdims=True)
     centre = (weights * mean).sum(axis=axis, keepdims=True) / np.where(total > 0, total, 1.0)
@@ -100,11 +100,11 @@ def no_tally(store: Store, bins: int) -> Tally:
 
 
 def tally(store: Store, field: Voxels, slat: Voxels, bins: int, by_asset: bool = False) -> Tally:
-    """Tally the voxels of one asset of a store by `bins` of the normalised values over [-1, 1].
+    """Tally the voxels of one asset of a store in `bins` of the normalised values over [-1, 1].
 
-    `field` and `slat` are classes and normalised properties in the shapes of ``grid/*`` ((R, R, R)
-    and (P, R, R, R)) and of ``voxel/*`` ((N,) and (N, P)). With `by_asset`, all voxels of a side
-    have weight 1 together, otherwise 1 each.
+    `field` and `slat` are classes and normalised properties, shaped like ``grid/*`` ((R, R, R)
+    and (P, R, R, R)) and ``voxel/*`` ((N,) and (N, P)). With `by_asset`, all voxels of a side
+    together have weight 1; otherwise each voxel has weight 1.
     """
     (grid, values), (material, properties) = field, slat
     labels = store.contents.n_labels
@@ -121,7 +121,7 @@ def _side(
     bins: int,
     by_asset: bool,
 ) -> dict[str, NDArray[Any]]:
-    """Tally voxels (N,) of one side, and normalised properties (P, K) of those with a class."""
+    """Tally voxels (N,) of one side; `properties` (P, K) are those of voxels with a class."""
     labels = store.contents.n_labels
     weight = np.float64(1.0 / max(len(material), 1) if by_asset else 1.0)
     classes = np.minimum(material, labels)
@@ -159,6 +159,6 @@ def _side(
 
 
 def _bins(values: NDArray[np.float32], bins: int) -> NDArray[np.int64]:
-    """Return the bin of each value, of equal bins over [-1, 1]."""
+    """Return the index of each value's bin among equal bins over [-1, 1]."""
     places: NDArray[np.int64] = ((values + 1.0) * (bins / 2)).astype(np.int64)
     return np.clip(places, 0, bins - 1)

@@ -1,6 +1,6 @@
-"""The picture of one alignment: before, after, labels and error from three directions.
+"""Draw one alignment: before, after, labels and error from three directions.
 
-Beside these panels stands a column: figures, a histogram of errors, the starts of the search.
+The column at the right has figures, a histogram of errors, and the starts of the search.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 1800, 1140
-"""Pixels of a picture of four columns."""
+"""Width and height, in pixels, of a picture with four columns."""
 
 PANEL = 300
 _LEFT, _TOP, _GAP = 48, 142, 14
 _MOST_LINES = 10
-"""Most lines of reasons in the column at the right."""
+"""Largest number of lines of reasons in the column at the right."""
 
 COLUMNS = {
     "before": "PixieVerse classes, SLAT outlined",
@@ -50,15 +50,15 @@ COLUMNS = {
     "result": "SLAT voxels by class received",
     "error": "distance to PixieVerse, scale at right",
 }
-"""Heading of each column that a picture can have, in their order, and what it shows."""
+"""Note below the heading of each possible column, by heading, from left to right."""
 
 
 _SIDE_WIDTH, _SIDE_MARGIN = 402, 48
-"""Width of the column, and of the margin at its right, in pixels."""
+"""Width of the column at the right, and of the margin beside it, in pixels."""
 
 _SHOWN = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
           "inlier_rmse_backward", "overlap", "valid_share", "ambiguity", "margin")  # fmt: skip
-"""The figures of a check on a picture."""
+"""Names of the check's figures that a picture shows."""
 
 _LINE = 21
 
@@ -71,10 +71,10 @@ def draw_alignment(
     alignment: Alignment,
     finer: int = 1,
 ) -> Figure:
-    """Draw an alignment as a figure of `WIDTH` x `HEIGHT` pixels, wider by its further columns.
+    """Draw an alignment as a figure of `WIDTH` x `HEIGHT` pixels; columns beyond four widen it.
 
-    A pixel of the figure has `finer` pixels of a panel along each edge. The figure must be drawn
-    and saved within `slatprep.inspect.pictures.canvas.STYLE`.
+    Panels have `finer` pixels per pixel of the figure along each edge. The figure must be drawn
+    and saved within `slatprep.inspect.pictures.canvas.styled`.
     """
     if alignment.open_placements:
         best = max(alignment.open_placements, key=lambda placement: placement.score)
@@ -120,7 +120,7 @@ def error_picture(scene: Scene, view: View) -> NDArray[np.float64]:
 
 
 def panels(scene: Scene, view: View) -> dict[str, NDArray[np.float64]]:
-    """Draw one row of a picture: the `COLUMNS` that it has, each (n, n, 3) in 0..1."""
+    """Draw one row of panels (n, n, 3) in 0..1, by the `COLUMNS` that the picture has."""
     sets = {"before": scene.before, "after": scene.after}
     if scene.deformed is not None:
         sets = {"before": scene.before, "similarity": scene.after, "deformed": scene.deformed}
@@ -167,7 +167,7 @@ def _axes_triad(figure: Figure, view: View, x: float, y: float) -> None:
 
 
 def _head(figure: Figure, check: AlignmentCheck, title: str, subtitle: str, left: float) -> int:
-    """Write title, verdict and reasons; return the height of the last reason."""
+    """Write title, verdict and reasons; return y of the last reason, in pixels from the top."""
     colour, bold = canvas.VERDICT_COLOURS[check.verdict], {"weight": "bold", "size": 13}
     canvas.write(figure, _LEFT, 50, title, **bold)
     canvas.note(figure, _LEFT, 76, subtitle, 7.5)
@@ -187,11 +187,11 @@ def _legend(figure: Figure, scene: Scene) -> None:
     y = _TOP + 3 * (PANEL + _GAP) + 12
     present = np.union1d(scene.before.material, scene.slat_material)
     share = np.bincount(scene.slat_material, minlength=256) / max(len(scene.slat_material), 1)
-    if len(present) > len(MATERIAL_CLASSES):  # Perhaps not all find room: the largest do.
+    if len(present) > len(MATERIAL_CLASSES):  # Not all may fit: the largest come first.
         present = present[np.argsort(-share[present], kind="stable")]
     names = [*scene.labels, *["not valid"] * (256 - len(scene.labels))]
     entries = [(f"{names[k]}  {share[k]:.1%}", MATERIAL_COLOURS[int(k)]) for k in present]
-    columns = 4 if scene.deformed is None else 3  # The fourth is above the scale.
+    columns = 4 if scene.deformed is None else 3  # The scale takes the place below the fourth.
     canvas.note(figure, _LEFT, y, "share of the SLAT voxels:", 6.8)
     box = _LEFT + 190, y, _LEFT + columns * (PANEL + _GAP) - _GAP
     canvas.draw_legend(figure, entries, box, edgecolor=canvas.MUTED, linewidth=0.5)
@@ -210,7 +210,7 @@ def _scale(figure: Figure, farthest: float, x: int, y: int) -> None:
 
 
 def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y: float) -> float:
-    """Write figures, thresholds and the size of the map; return the height of the last line."""
+    """Write figures, thresholds and the extent of the map; return y of the last line, in pixels."""
     columns = (left, left + 312, left + _SIDE_WIDTH)
     for x, name in zip(columns, ("figure", "value", "good"), strict=True):
         canvas.note(figure, x, y, name, 6.8, ha="left" if x == left else "right")
@@ -246,7 +246,7 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y
 
 
 def _histogram(figure: Figure, scene: Scene, radius: float, left: float, y: float) -> None:
-    """Draw the histogram of errors, and as a line that of the errors before."""
+    """Draw the histogram of errors as bars, and that of the errors before as a line."""
     share = float((scene.error <= radius).mean())
     heading, before = "error per SLAT surface voxel", "before"
     if scene.deformed is not None:
@@ -305,7 +305,7 @@ def _heading(figure: Figure, left: float, y: float, heading: str, words: str) ->
 
 
 def _plot(figure: Figure, left: float, y: float, heading: str, words: str) -> Axes:
-    """Return axes below a heading in the column at the right."""
+    """Write a heading in the column at the right; return axes below it."""
     _heading(figure, left, y, heading, words)
     axes = canvas.add_axes(figure, left + 40, y + 36, _SIDE_WIDTH - 40, 190)
     axes.tick_params(length=2.5, width=0.6)

@@ -1,4 +1,4 @@
-"""Figures with positions in pixels, and the colours, style and formats of all pictures."""
+"""Draw figures by positions in pixels; colours, style and formats of all pictures."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 VERDICT_COLOURS = {"good": "#1B7F4B", "doubtful": "#B26A00", "failed": "#B3261E"}
-"""Colour of each verdict, which is always written out too."""
+"""Colour of each verdict; pictures also write the verdict as text."""
 
 ACCENT = "#2E9FF5"
 RULE = "#D5D9DE"
 PAPER = "#FFFFFF"
-"""Highlight, lines and background."""
+"""Colours of highlights, lines and the background."""
 
 DISTANCE_COLOURS = ("#EEF1F4", "#F3BDB6", "#DD6472", "#931D52", "#2B0A3D")
-"""Distances from 0 to the end of the scale, in even steps of lightness."""
+"""Colours of distances from 0 to the end of the scale, in even steps of lightness."""
 
 DPI = 150
 
 MOST_NAMES = 16
-"""Most names of a legend: more colours cannot be told apart."""
+"""Largest number of names in a legend: more colours cannot be told apart."""
 
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -48,14 +48,14 @@ STYLE: dict[str, Any] = {
     "xtick.labelsize": 7.0,
     "ytick.labelsize": 7.0,
     "figure.facecolor": PAPER,
-    "svg.hashsalt": "slatprep",  # Otherwise ids within a file are random.
+    "svg.hashsalt": "slatprep",  # Without it, ids within a file are random.
     "pdf.fonttype": 42,
 }
 """Settings of matplotlib."""
 
 
 def styled() -> AbstractContextManager[None]:
-    """Hold matplotlib to `STYLE`, whatever a user's matplotlibrc says."""
+    """Set matplotlib's style to `STYLE`, regardless of the user's matplotlibrc."""
     import matplotlib.style
 
     return matplotlib.style.context(["default", STYLE])
@@ -66,7 +66,7 @@ FORMATS: dict[str, dict[str, None]] = {
     "svg": {"Date": None},
     "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
-"""Formats of a picture, with the metadata to leave out so that its bytes do not vary."""
+"""Formats of a picture, with the metadata to omit so that its bytes do not vary."""
 
 
 def in_format(figure: Figure, kind: str = "png") -> bytes:
@@ -77,7 +77,7 @@ def in_format(figure: Figure, kind: str = "png") -> bytes:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in pixels."""
+    """Return an empty figure whose size is given in pixels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -87,14 +87,14 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def size_of(figure: Figure) -> tuple[float, float]:
-    """Return width and height in pixels."""
+    """Return a figure's width and height in pixels."""
     return figure.get_figwidth() * DPI, figure.get_figheight() * DPI
 
 
 def write(figure: Figure, x: float, y: float, words: str, **style: Any) -> None:
-    """Write text at a pixel of the figure, from its upper left corner."""
+    """Write text at a pixel, counted from the figure's upper left corner."""
     width, height = size_of(figure)
-    # Names may contain $, which would begin a formula.
+    # Names may contain $, which matplotlib would read as the start of a formula.
     figure.text(x / width, 1 - y / height, words, parse_math=False, **style)
 
 
@@ -104,7 +104,7 @@ def note(figure: Figure, x: float, y: float, words: str, size: float = 7.0, **st
 
 
 def draw_image(figure: Figure, x: int, y: int, image: NDArray[np.float64], finer: int = 1) -> None:
-    """Put an image (rows, columns, 3) in 0..1 at a pixel, with `finer` of its pixels to one."""
+    """Draw an image (rows, columns, 3) in 0..1 at a pixel, with `finer` image pixels per pixel."""
     pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     tall, wide = (side / finer for side in image.shape[:2])
     if finer == 1:
@@ -117,7 +117,7 @@ def draw_image(figure: Figure, x: int, y: int, image: NDArray[np.float64], finer
 
 
 def add_axes(figure: Figure, x: float, y: float, wide: float, tall: float) -> Axes:
-    """Return axes that begin at a pixel, and are so wide and tall in pixels."""
+    """Return axes with their upper left corner at a pixel; width and height are in pixels."""
     width, height = size_of(figure)
     return figure.add_axes((x / width, 1 - (y + tall) / height, wide / width, tall / height))
 
@@ -132,7 +132,7 @@ def draw_line(figure: Figure, x: float, y: float, end: tuple[float, float], colo
 
 
 def cut(words: str, most: int) -> str:
-    """Return words of so many characters at most."""
+    """Return words cut to `most` characters."""
     return words if len(words) <= most else f"{words[: most - 1]}…"
 
 
@@ -144,9 +144,9 @@ def draw_legend(
 ) -> None:
     """Write names beside squares of their colours, from left to right, in two rows at most.
 
-    `entries` are names and colours. The number of entries beyond the room or `MOST_NAMES` follows
-    the last one. `box` is left edge, first baseline and right edge in pixels; a row takes 20.
-    `style` goes to `matplotlib.patches.Rectangle`.
+    `entries` are names and colours. If entries exceed the space or `MOST_NAMES`, the number of
+    omitted ones follows the last. `box` is left edge, first baseline and right edge in pixels; a
+    row is 20 pixels high. `style` goes to `matplotlib.patches.Rectangle`.
     """
     from matplotlib.patches import Rectangle
 

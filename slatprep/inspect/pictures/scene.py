@@ -1,4 +1,4 @@
-"""The content of a picture of an alignment: two voxel sets, their classes, and errors."""
+"""Prepare what a picture of an alignment shows: two voxel sets, their classes, and errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from slatprep.store.reader import StoredAsset
 from slatprep.store.records import StoredRecords
 
 FARTHEST = 3.0
-"""End of the scale of distances [voxel]."""
+"""Upper end of the scale of distances [voxel]."""
 
 VIEWPOINTS = ((300.0, 22.0), (60.0, 22.0), (205.0, 50.0))
 """Azimuth and elevation [degree] of the three views of a picture."""
@@ -49,12 +49,12 @@ class Scene:
     slat : ndarray of uint8, shape (N, 3)
         Cells of the 64^3 grid that SLAT voxels occupy.
     slat_material : ndarray of uint8, shape (N,)
-        Their classes by the lookup; 255 if not valid.
+        Class that each cell received in the lookup; 255 if not valid.
     surface : ndarray of uint8, shape (M, 3)
-        The SLAT's outer voxels, on which errors are measured.
+        Outer voxels of the SLAT, at which errors are measured.
     error, error_before : ndarray of float64, shape (M,)
         Distance [voxel] of each to the nearest outer voxel of the PixieVerse field, after and
-        before the alignment. With a deformation, "before" is under the transform alone.
+        before the alignment. With a deformation, "before" uses the transform alone.
     deformed : Placed or None
         If the asset has a deformation, the deformed PixieVerse field on the SLAT's grid: boundary
         of the cells whose centre maps into an occupied voxel.
@@ -63,7 +63,7 @@ class Scene:
     labels : tuple of str
         Names of the classes.
     tied : ndarray of float64, shape (4, 4), or None
-        The best of the other placements that fit about as well, if there are such.
+        Transform of the best open tie, if there is one.
     """
 
     before: Placed
@@ -85,12 +85,12 @@ class Scene:
 
     @property
     def displacement_scale(self) -> float:
-        """The end of the scale of displacements: the largest one, rounded up to a voxel."""
+        """Upper end of the scale of displacements: the largest one, rounded up to a whole voxel."""
         return max(float(np.ceil(self.displacement.max())), 1.0)
 
 
 def scene_of(asset: StoredAsset) -> Scene:
-    """Return the scene of an asset as stored.
+    """Return the scene of a stored asset.
 
     Raises StoreError if the asset is deformed and its record, with the deformation, is unreadable.
     """
@@ -135,7 +135,7 @@ def surface_distance(
 ) -> NDArray[np.float64]:
     """Return the distance (M,) [voxel] of each SLAT voxel to the nearest PixieVerse voxel.
 
-    Surface voxels (M, 3) and (K, 3) are each in their own frame.
+    Surface voxels (M, 3) and (K, 3) are each in their own frame; `way` maps between the frames.
     """
     from slatprep.geometry.nearest import Lattice
 
@@ -145,7 +145,7 @@ def surface_distance(
 
 
 def views(scene: Scene, size: int) -> tuple[View, ...]:
-    """Return the three views, at one scale at which the sets fit before and after."""
+    """Return the three views, at one scale at which all voxel sets fit."""
     sets = (scene.before, scene.after, scene.placed)
     field = [apply_transform(one.transform, voxel_centres(one.voxels)) for one in sets]
     points = np.concatenate([*field, voxel_centres(scene.slat)])
@@ -155,7 +155,7 @@ def views(scene: Scene, size: int) -> tuple[View, ...]:
         seen = points @ rotation.T
         low, high = seen.min(axis=0), seen.max(axis=0)
         placed.append((rotation, rotation.T @ ((low + high) / 2), (high - low)[:2].max() / 2))
-    # Room for the diagonal of voxels at the edge, and for the outline.
+    # Two voxels leave room for the diagonal of voxels at the edge, and for the outline.
     half_width = max(reach for _, _, reach in placed) + 2 * VOXEL_SIZE
     return tuple(View(rotation, centre, float(half_width), size) for rotation, centre, _ in placed)
 

@@ -1,4 +1,4 @@
-"""A store as a picture: statistics of its voxels, or the errors of its alignments."""
+"""Draw the statistics of a store's voxels, or the errors of its alignments."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_CATEGORIES = 16
-"""Most categories with a bar: those with most assets."""
+"""Largest number of categories with a bar; categories with most assets come first."""
 
 _WIDTH, _HEAD, _FOOT = 1500, 170, 60
 _LEFT, _GAP, _PLOT = 210, 100, 535
 """Left margin, gap between the two columns of plots, and width of a plot, in pixels."""
 _HISTOGRAM, _JOINT, _BAR, _BETWEEN = 190, 480, 26, 90
-"""Heights of the kinds of plots, and of the gap between two rows, in pixels."""
+"""Heights of each kind of plot, and of the gap between two rows, in pixels."""
 _COLOURS = tuple(MATERIAL_COLOURS.values())
 """Colours of the classes by index."""
 RATES = {0.01: "-", 0.05: "--"}
-"""Shares of wrong ones with a line, and how it is drawn."""
+"""Line style of each share of wrong alignments that has a line."""
 
 _SIDES = (("field", "PixieVerse fields, before the lookup"), ("slat", "SLAT voxels, after it"))
 
@@ -105,7 +105,7 @@ def _joint(axes: Axes, histograms: Sequence[Histogram], joint: JointHistogram, s
     shares = np.ma.masked_equal(_shares(getattr(joint, side)), 0.0)
     first, second = (one for one in histograms if one.name in joint.names)
     colours = LinearSegmentedColormap.from_list("shares", canvas.DISTANCE_COLOURS[1:])
-    # The scale ends at 1e-5; smaller shares have its palest colour.
+    # The scale begins at 1e-5; smaller shares have its palest colour.
     mesh = axes.pcolormesh(
         *joint.edges, shares.T, cmap=colours, norm=LogNorm(1e-5, 1.0), rasterized=True
     )
@@ -149,7 +149,7 @@ def _percent(share: float) -> str:
 def draw_errors(errors: MeasuredErrors, name: str, kind: str = "png") -> bytes:
     """Draw the scores of a store's alignments and of its decoys as a ``png``, ``svg`` or ``pdf``.
 
-    Lines are the least scores that keep the share of wrong ones at `RATES`.
+    Lines mark the lowest scores that keep the share of wrong alignments at `RATES`.
     """
     from scipy.special import logit
 

@@ -1,4 +1,4 @@
-"""An alignment as meshes in Open3D's interactive viewer."""
+"""Show an alignment as meshes in Open3D's interactive viewer."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ APART = 1.25
 
 
 def has_screen(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
-    """Whether the environment names a display on which a window can be opened."""
+    """Return whether the environment names a display on which a window can be opened."""
     if platform in ("darwin", "win32"):
         return True
     return bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
 
 
 def show_alignment(scene: Scene, title: str) -> bool:
-    """Show before, after, result and error in a window; return when it is closed.
+    """Show before, after, result and error in a window until it is closed.
 
-    Returns whether a window could be opened. SlatprepError if Open3D is not installed.
+    Returns whether a window could be opened. Raises SlatprepError if Open3D is not installed.
     """
     from slatprep.align import require_engine
     from slatprep.align.open3d_icp import load_open3d
@@ -57,7 +57,7 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]
 
 
 def meshes(scene: Scene) -> tuple[Mesh, ...]:
-    """Return the four parts side by side along x, in the SLAT frame."""
+    """Return before, after, result and error as meshes side by side along x, in the SLAT frame."""
     slat = Placed(scene.slat, scene.slat_material, np.eye(4))
     by_class = (scene.before, scene.placed, slat)
     parts = [cube_mesh(one.voxels, class_colours(one.material), one.transform) for one in by_class]
@@ -71,9 +71,9 @@ def meshes(scene: Scene) -> tuple[Mesh, ...]:
 def cube_mesh(
     voxels: NDArray[np.uint8], colours: NDArray[np.float64], transform: ArrayLike
 ) -> Mesh:
-    """Return the exposed faces of voxels (N, 3) as triangles, with four vertices a face.
+    """Return the exposed faces of voxels (N, 3) as triangles, with four vertices per face.
 
-    `colours` (N, 3) are in 0..1; `transform` (4, 4) leads to the frame that is shown. Triangles are
+    `colours` (N, 3) are in 0..1; `transform` (4, 4) maps to the frame that is shown. Triangles are
     counterclockwise seen from outside.
     """
     empty = ~np.pad(occupancy_of(voxels), 1)

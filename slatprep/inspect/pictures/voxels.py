@@ -1,4 +1,4 @@
-"""Voxels drawn as shaded cubes with numpy.
+"""Draw voxels as shaded cubes with numpy.
 
 An orthographic view shows at most three sides of every cube, each as the same parallelogram. Its
 pixels are computed once and copied to every exposed face, with a depth buffer: ten thousand voxels
@@ -16,7 +16,7 @@ from slatprep.geometry.frames import VOXEL_SIZE, apply_transform, voxel_centres
 from slatprep.geometry.voxels import occupancy_of
 
 SUPERSAMPLING = 3
-"""Pixels drawn per pixel of the picture, along each edge."""
+"""Number of pixels drawn per pixel of the picture, along each edge."""
 
 LIGHT = np.array([-0.35, 0.75, 0.56])
 """Direction to the light in the axes of the picture: upper left, behind the viewer."""
@@ -37,11 +37,11 @@ class View:
     rotation : ndarray of float64, shape (3, 3)
         Rows are the directions right, up and towards the viewer.
     centre : ndarray of float64, shape (3,)
-        The point in the middle of the picture.
+        Point in the middle of the picture.
     half_width : float
         Half the width of the picture, in edges of the cube.
     size : int
-        Pixels along each side of the picture.
+        Number of pixels along each side of the picture.
     """
 
     rotation: NDArray[np.float64]
@@ -58,7 +58,7 @@ class View:
 class Drawing:
     """A picture of one voxel set: ``rgb`` (n, n, 3) in 0..1 and ``cover`` (n, n) in 0..1.
 
-    ``rgb`` is white where nothing covers it.
+    ``rgb`` is white where no voxel covers it.
     """
 
     rgb: NDArray[np.float64]
@@ -68,7 +68,8 @@ class Drawing:
 def view_rotation(azimuth: float, elevation: float) -> NDArray[np.float64]:
     """Return the axes (3, 3) of a view with z upwards; rows are right, up and towards the viewer.
 
-    `azimuth` is in degrees about z from the x axis to the viewer, `elevation` in degrees above xy.
+    `azimuth` is the angle [degree] about z from the x axis to the viewer, `elevation` the angle
+    [degree] above the xy plane.
 
     >>> (view_rotation(270, 0).round() + 0.0).tolist()  # from in front: x right, z up
     [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
@@ -88,8 +89,8 @@ def draw_voxels(
 ) -> Drawing:
     """Draw voxels (N, 3) in 0..63 as shaded cubes, with colours (N, 3) in 0..1.
 
-    `transform` (4, 4) leads to the frame of the view. `contrast` in 0..1 darkens the sides that
-    face away from the light; small values keep colours readable as numbers.
+    `transform` (4, 4) maps to the frame of the view. `contrast` in 0..1 darkens the sides that
+    face away from the light; small values keep colours comparable with a scale.
     """
     side = view.size * SUPERSAMPLING
     pixels_per_unit = side / (2 * view.half_width)
@@ -122,7 +123,7 @@ def draw_voxels(
         face = drawn + np.arange(len(exposed), dtype=np.int64)
         key = (quantised.astype(np.int64) << _FACE_BITS) | (face[:, None] << 1) | seams
         inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-        # The largest key is the nearest face; the order of faces does not matter.
+        # The largest key is the nearest face, whatever the order of the faces.
         np.maximum.at(buffer, (y * side + x)[inside], key[inside])
         normal = sign * linear[:, axis] / np.linalg.norm(linear[:, axis])
         owners.append(exposed)
@@ -140,7 +141,7 @@ def _side_pixels(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]] | None:
     """Return the pixels of a cube's side relative to its centre, their depths, and its seams.
 
-    `spanned` (3, 2) has the two edges of the side in pixels. None if it is seen edge-on.
+    `spanned` (3, 2) has the two edges of the side in pixels. Returns None for a side seen edge-on.
     """
     plane = spanned[:2]
     if abs(np.linalg.det(plane)) < 1e-3:
@@ -149,7 +150,7 @@ def _side_pixels(
     grid = np.arange(-reach, reach + 1)
     offsets = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
     along = offsets @ np.linalg.inv(plane).T
-    # Half a pixel more on every edge, since centres are rounded to pixels.
+    # Every edge gets half a pixel more, because centres are rounded to pixels.
     slack = 0.5 * np.abs(np.linalg.inv(plane)).sum(axis=1)
     inside = (np.abs(along) <= 0.5 + slack).all(axis=1)
     seam = (np.abs(along) > 0.5 - slack).any(axis=1)
@@ -157,7 +158,7 @@ def _side_pixels(
 
 
 def _resolve(buffer: NDArray[np.int64], lit: NDArray[np.float64], view: View) -> Drawing:
-    """Turn the buffer into colours, with darker seams and outlines, at the picture's size."""
+    """Convert the buffer to colours at the picture's size, with darker seams and outlines."""
     covered = buffer >= 0
     face = (buffer & ((1 << _FACE_BITS) - 1)) >> 1
     tone = np.where(buffer & 1, 1.0, _SEAM)
@@ -176,7 +177,7 @@ def _averaged(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _steps_down(depth: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the pixels that have a much farther neighbour."""
+    """Return a mask of the pixels that have a much farther neighbour."""
     from scipy.ndimage import minimum_filter1d
 
     beside = (minimum_filter1d(depth, 3, axis, mode="constant", cval=-np.inf) for axis in (0, 1))

@@ -1,4 +1,4 @@
-"""Pictures of alignments as files: one for each, and a contact sheet of many."""
+"""Write pictures of alignments: a file for each, and a contact sheet of many."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ SHEET = "sheet.png"
 """Name of the contact sheet in a folder of pictures."""
 
 MOST = 60
-"""Most assets on one sheet."""
+"""Largest number of assets on one sheet."""
 
 _ACROSS = 4
 _THUMBNAIL = 200
 _MARGIN, _HEAD, _GAP = 40, 84, 20
 _TITLE = 26
-"""Most characters of a title beside the verdict."""
+"""Largest number of characters of a title beside the verdict."""
 _CELL_WIDTH, _CELL_HEIGHT = 2 * _THUMBNAIL + _GAP, _THUMBNAIL + 66
 
 
@@ -48,10 +48,10 @@ def write_pictures(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> tuple[list[Path], Path | None]:
-    """Draw alignments as files; return the file of each asset, and the contact sheet if several.
+    """Draw alignments as files; return the file of each asset, and the contact sheet or None.
 
-    For a single asset `target` is a file with a suffix of `FORMATS`, otherwise a folder for a PNG
-    per asset, named by its id, and a contact sheet of the first `MOST`.
+    For a single asset, `target` may be a file with a suffix of `FORMATS`. Otherwise it is a folder,
+    with a PNG per asset, named by its id. Several assets also get a sheet of the first `MOST`.
     """
     kind = target.suffix.lower()[1:]
     if len(checks) == 1 and kind in canvas.FORMATS:
@@ -90,7 +90,7 @@ def picture_of(asset: StoredAsset) -> Image:
 
 
 class _Cell(NamedTuple):
-    """An asset on a contact sheet: its check, its title, and its images side by side."""
+    """One asset of a contact sheet: its check, its title, and its images side by side."""
 
     check: AlignmentCheck
     title: str
@@ -100,7 +100,7 @@ class _Cell(NamedTuple):
 def _drawn(
     path: Place, check: AlignmentCheck, kind: str, on_sheet: bool
 ) -> tuple[str, bytes, _Cell | None]:
-    """Return an asset's id, its picture, and what is on the sheet of it."""
+    """Return an asset's id, its picture, and its cell of the sheet if `on_sheet`."""
     store = open_store(path)
     asset = store.asset(check.asset_id)
     scene, title = scene_of(asset), title_of(asset)
@@ -121,7 +121,7 @@ def _cell(asset: StoredAsset, scene: Scene, check: AlignmentCheck) -> _Cell:
 
 
 def _sheet(cells: Sequence[_Cell]) -> bytes:
-    """Draw assets, in this order, as one PNG."""
+    """Draw cells, in their order, as one PNG."""
     columns = min(_ACROSS, max(len(cells), 2))
     rows = -(-len(cells) // columns)
     width = 2 * _MARGIN + columns * (_CELL_WIDTH + _GAP) - _GAP
@@ -148,7 +148,7 @@ def _sheet(cells: Sequence[_Cell]) -> bytes:
 
 
 def title_of(asset: StoredAsset) -> str:
-    """Return the title of an asset's picture: its category where it is known, and its id."""
+    """Return the title of an asset's picture: its category, if known, and its id."""
     category = str(asset.columns["category"]).replace("_", " ")
     return f"{category}: {asset.asset_id}" if category else asset.asset_id
 

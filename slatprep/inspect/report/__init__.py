@@ -1,8 +1,8 @@
-"""The report on a dataset: a single HTML file that opens in a browser without a network.
+"""Write the report on a dataset: a single HTML file that opens in a browser without a network.
 
 It is a template with its style, its scripts and the data. Data cannot run as code: browsers do not
-execute its blocks, and the page shows it only as text. A content security policy allows the page's
-own scripts by their hashes, and no requests.
+execute data blocks, and the page shows data only as text. A content security policy allows only
+the page's own scripts, by their hashes, and no requests.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from slatprep.workers.local import run_unordered
 __all__ = ["ReportSummary", "write_report"]
 
 ASSETS_IN_DETAIL = 5_000
-"""Most assets with a thumbnail and a 3D view."""
+"""Largest number of assets with a thumbnail and a 3D view."""
 
 ASSETS_LISTED = 50_000
-"""Most assets in the table; of a larger store it has a sample, those in detail."""
+"""Largest number of assets in the table; for a larger store it has only the assets in detail."""
 
 VOXEL_BYTES = 36_000_000
-"""Most bytes of voxels at full detail, before base64 makes them a third larger."""
+"""Largest size in bytes of voxels at full detail, before base64 makes them a third larger."""
 
 
 SCRIPTS = ("format", "data", "charts", "table", "viewer", "sections", "app")
-"""The page's own scripts; each may use those before it."""
+"""Names of the page's own scripts; a script may use the scripts before it."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,15 @@ class ReportSummary:
     path : Path
         The HTML file.
     size : int
-        Its bytes.
+        Size of the file in bytes.
     assets : int
-        Assets of the build, whether in the store or not.
+        Number of assets of the build, in the store or not.
     listed : int
-        Assets in the table: all, or a sample of more than `ASSETS_LISTED`.
+        Number of assets in the table: all, or a sample if there are more than `ASSETS_LISTED`.
     in_detail : int
-        Assets with a thumbnail and a 3D view.
+        Number of assets with a thumbnail and a 3D view.
     side : int
-        Voxels per edge of the 3D views: 64, or 32 where 64 would exceed `VOXEL_BYTES`.
+        Voxels per edge of the 3D views: 64, or 32 if 64 would exceed `VOXEL_BYTES`.
     """
 
     path: Path
@@ -84,17 +84,17 @@ def write_report(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> ReportSummary:
-    """Write the page of a store.
+    """Write the report on a store.
 
     Parameters
     ----------
     store : Store
-        From `slatprep.store.open_store`.
+        Open store, from `slatprep.store.open_store`.
     out : Path
         The HTML file; an existing file is replaced when the new one is complete.
     manifests : Path, optional
         Folder of the build's records. Without them the page cannot say which assets are
-        not in the store, and why.
+        missing from the store, and why.
     jobs : int
         Worker processes. The page's bytes do not depend on it.
     progress : callable, optional
@@ -103,7 +103,7 @@ def write_report(
     Returns
     -------
     ReportSummary
-        Its size and contents.
+        Size and contents of the page.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def _chosen(store: Store) -> list[int]:
     total = len(store)
     if total <= ASSETS_IN_DETAIL:
         return list(range(total))
-    # First those that are not good, then others at even steps through the store.
+    # Up to half are assets that are not good; the others are at even steps through the store.
     doubtful = np.flatnonzero(store.column("verdict") != str(Verdict.GOOD))
     doubtful = doubtful[: ASSETS_IN_DETAIL // 2]
     spread = np.linspace(0, total - 1, ASSETS_IN_DETAIL - len(doubtful)).round().astype(int)
@@ -164,7 +164,7 @@ def _chosen(store: Store) -> list[int]:
 def _write_page(
     file: TextIO, content: Mapping[str, Any], drawn: Sequence[Drawn], side: int
 ) -> None:
-    """Write a page of `page_content`, with assets `drawn` by `side` voxels per edge."""
+    """Write a page from `page_content`, with `drawn` assets at `side` voxels per edge."""
     sheets = [drawn[start : start + PER_SHEET] for start in range(0, len(drawn), PER_SHEET)]
     style = _asset("style.css")
     script = "\n".join(_asset("js", f"{name}.js") for name in SCRIPTS)
@@ -178,7 +178,7 @@ def _write_page(
     for name, text in (("style", style), ("policy", policy), ("title", title)):
         head = head.replace(f"{{{{{name}}}}}", text)
     file.write(head)
-    # The data come first, so that the table works while the browser still reads the pictures.
+    # The table's data precede the pictures, so the table works while the browser reads these.
     _block(file, "content", "application/json", _json(content))
     file.write(f"<script>{script}</script>\n")
     _block(file, "library", "text/plain", library)

@@ -1,4 +1,4 @@
-"""The content of the page as one JSON document, without its layout."""
+"""Collect the content of the page as one JSON document, without its layout."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from slatprep.store.reader import Store
 from slatprep.store.record import AssetRecord, BuildRecord, FailedRecord
 from slatprep.store.records import StoredRecords, build_in
 
-# Matplotlib's viridis (CC0) at even steps: its lightness rises with the value, so that
+# Matplotlib's viridis (CC0) at even steps. Its lightness rises with the value, so
 # colour-blind readers can order the colours too.
 _PROPERTY_COLOURS = ("#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80",
                      "#5EC962", "#ADDC30", "#FDE725")  # fmt: skip
@@ -39,30 +39,30 @@ _FIGURES = ("confidence", "same_object", "right_placement", "expected_accuracy",
             "margin")  # fmt: skip
 
 _UNTOLD: Mapping[str, Any] = {"ties": [], "reasons": []}
-"""What the table says of an asset without the records of its build."""
+"""Columns of an asset whose record is not read."""
 
 MOST_TIES = 8
-"""Most tied placements of an asset on the page."""
+"""Largest number of tied placements that the page has for an asset."""
 
 DIGITS = 5
-"""Decimal places of numbers on the page."""
+"""Number of decimal places of numbers on the page."""
 
-# Not "failed", which is a verdict on an alignment: these were not aligned at all.
+# "failed" is a verdict on an alignment, and these assets were not aligned at all.
 _ABSENT = {Status.FAILED: "not built", Status.SKIPPED: "skipped"}
 
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 
 _PATH = re.compile(r"^(?:/.*?|\S*[/\\.]\S*): ")
-"""The path that a reason begins with."""
+"""Pattern of the path at the start of a reason."""
 
 Columns = dict[str, Any]
-"""What the table on the page says of one asset, by the names of its columns."""
+"""Values of one asset in the page's table, by the names of its columns."""
 
 
 def build_of(manifests: Place, store: Store, most_absent: int) -> BuildRecord:
-    """Return the record of a store's build, with at most so many assets that are not in it, by id.
+    """Return the record of a store's build, with at most `most_absent` failed assets, by id.
 
-    StoreError if it cannot be read, or is of another build.
+    Raises StoreError if the record cannot be read, or belongs to another build.
     """
     build = build_in(manifests)
     if build.id != store.about.manifest:
@@ -76,7 +76,7 @@ def build_of(manifests: Place, store: Store, most_absent: int) -> BuildRecord:
 
 
 def told_by_records(store: Store, listed: Iterable[int]) -> dict[int, Columns]:
-    """Return what records say of assets, by their rows; StoreError if one cannot be read."""
+    """Return columns from the assets' records, by row; raise StoreError if one is unreadable."""
     records = StoredRecords(store)
     return {row: _columns_of(records.read(row)) for row in listed}
 
@@ -85,7 +85,7 @@ def _columns_of(record: AssetRecord) -> Columns:
     placements, merged = record.alignment.placements, record.merged
     return {
         "reasons": list(record.judgement.reasons),
-        # Distinct placements that fit about as well as the best, and the first of their transforms.
+        # "tied" counts all tied placements; "ties" has the transforms of the first ones.
         "tied": len(placements),
         "ties": [
             [round(number, 6) for number in one.transform[:3].ravel().tolist()]
@@ -97,12 +97,12 @@ def _columns_of(record: AssetRecord) -> Columns:
 
 
 def rounded(value: float | None) -> float | None:
-    """Return a number with as many digits as the page has; None where it is not finite."""
+    """Return a number rounded to `DIGITS` decimal places; None if it is not finite."""
     return None if value is None or not np.isfinite(value) else round(value, DIGITS)
 
 
 def kinds_of(reasons: Iterable[str]) -> dict[str, str]:
-    """Return each reason without its file, and without numbers but those that all of a kind share.
+    """Map each reason to its kind: the reason without its file, with N for numbers that vary.
 
     >>> list(kinds_of(["only 7% lie within 1 voxel", "only 8.5% lie within 1 voxel"]).values())
     ['only N% lie within 1 voxel', 'only N% lie within 1 voxel']
@@ -134,10 +134,10 @@ def page_content(
 ) -> dict[str, Any]:
     """Return the content of a page, JSON-ready; NaN and unknown values are None.
 
-    `built` and `told` come from the records, if any, and `tallies` count voxels by category. Rows
-    `listed` are in the table, those `drawn` also have a thumbnail and a 3D view with `side` voxels
-    per edge; both ascend. Columns of the table are lists over assets, those of the store first;
-    ``all`` counts also assets outside it.
+    `built` and `told` come from the records, if any, and `tallies` count voxels by category. The
+    table has the `listed` rows; `drawn` rows also have a thumbnail and a 3D view with `side` voxels
+    per edge. Both ascend. Columns of the table are lists over assets, with the store's assets
+    first; ``all`` also counts assets outside the store.
     """
     build, labels = store.about.build, store.contents.labels
     states = Counter(map(str, store.column("verdict")))
@@ -195,7 +195,7 @@ def page_content(
 
 
 def _errors(store: Store) -> dict[str, Any]:
-    """Return what decoys say of the verdicts, and the histograms of scores that show it."""
+    """Return the verdicts' error rates measured on decoys, and the histograms of scores."""
     measured, told = measured_errors(store.path), {"told": told_of(store)}
     if measured is None:
         return told
@@ -236,7 +236,7 @@ def _properties(store: Store, tallies: Mapping[str, Tally], clipped: bool) -> li
 
 
 def _balance(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]:
-    """Return the number of SLAT voxels by category and class, those that are not valid last."""
+    """Return the number of SLAT voxels by category and class, with those not valid last."""
     assets = Counter(str(category) for category in store.column("category"))
     return [
         {
@@ -300,9 +300,9 @@ def _table(
 
 
 def nearest_quarter_turn(transform: ArrayLike) -> tuple[int, float]:
-    """Return the quarter turn nearest to the rotation of a transform (4, 4), and their angle.
+    """Return the quarter turn nearest to a transform's rotation, and the angle between them.
 
-    The first is an index of `quarter_turns`, the second is in degrees.
+    `transform` is (4, 4). The turn is an index of `quarter_turns`, the angle is in degrees.
     """
     turns = [start.rotation for start in distinct_starts()]
     angles = degrees_between(turns, split_transform(transform)[0])

@@ -1,10 +1,10 @@
-"""An asset of the store as the page shows it: a thumbnail, and its voxels in a few kilobytes.
+"""Draw an asset as the page shows it: a thumbnail, and its voxels in a few kilobytes.
 
-A thumbnail shows three directions; many lie in one image file. Unlike
-`slatprep.inspect.pictures.voxels.draw_voxels`, it is shaded by the slope of the surface. Along an
-axis of the grid only one face of each cube is visible, and all faces would have the same tone. It
-is also ten times as fast (3 against 30 ms an asset, 12 assets of 12,400 voxels). Palette indices
-make a sheet a third as large as colours.
+A thumbnail shows three directions; one image file holds many thumbnails. They are shaded by the
+slope of the surface, unlike `slatprep.inspect.pictures.voxels.draw_voxels`. Along an axis of the
+grid only one face of each cube is visible, and all faces would have the same tone. This is also
+ten times as fast (3 ms per asset, not 30; 12 assets of 12,400 voxels). Palette indices make a
+sheet a third as large as colours.
 
 For the 3D view an asset is one stream of raw deflate (RFC 1951), which browsers can unpack. It
 holds, for n voxels per edge and voxels in C order of the grid::
@@ -20,8 +20,8 @@ and for a deformed asset also::
     3 K bytes       displacement of the centre of each boundary voxel along x, y and z of its
                     own frame before the transform, int8, in steps
 
-Properties are quantised to `LEVELS` over [-1, 1] and distances over 0 to the
-largest distance allowed; 255 means not valid, for a class as well.
+Properties are quantised to `LEVELS` steps over [-1, 1], and distances over 0 to the largest
+allowed distance. 255 means not valid, also for a class.
 """
 
 from __future__ import annotations
@@ -43,43 +43,43 @@ from slatprep.records import COLOURS, RESOLUTION, UNANNOTATED
 from slatprep.store import StoredAsset
 
 VIEWS = 3
-"""From the front (along +y), from the right (along -x) and from above (along -z)."""
+"""Number of views: from the front (along +y), from the right (-x) and from above (-z)."""
 
 PER_SHEET = 64
-"""Pictures in one image file."""
+"""Number of pictures in one image file."""
 
 COLUMNS = 8
-"""Pictures side by side in an image file."""
+"""Number of pictures side by side in an image file."""
 
 SHADES = 8
-"""Steps of brightness."""
+"""Number of steps of brightness."""
 
 CLASSES = 30
-"""Classes with a colour of their own."""
+"""Number of classes with a colour of their own."""
 
 SIDE = RESOLUTION + 6
-"""Pixels along each edge of a view, margin included."""
+"""Number of pixels along each edge of a view, margin included."""
 
 _BRIGHTEST, _DARKEST = 1.12, 0.5
 _LIGHT = (-0.35, -0.5, 0.79)  # from above left: columns, rows, towards the viewer
 _SMOOTHING = 5
 
 LEVELS = 64
-"""Steps of a quantised property or distance, finer than a colour scale can show."""
+"""Number of steps of a quantised property or distance, finer than a colour scale can show."""
 
 FULL, COARSE = RESOLUTION, RESOLUTION // 2
-"""Voxels per edge of the two levels of detail."""
+"""Number of voxels per edge at the two levels of detail."""
 
 BINS = 64
-"""Bins of the histograms of normalised properties, over [-1, 1]."""
+"""Number of bins of the histograms of normalised properties, over [-1, 1]."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """An asset of the store as drawn: thumbnail, and voxels by level of detail.
+    """A drawn asset of the store: thumbnail, and voxels by level of detail.
 
     For merged labels, ``votes`` is the mean share of votes for a voxel's class. ``spreads`` has the
-    mean spread of each normalised property, NaN where a single annotation has it.
+    mean spread of each normalised property, NaN if no voxel has a spread.
     """
 
     index: int
@@ -101,7 +101,7 @@ def draw_asset(store: SourceStore, row: int) -> tuple[Drawn, Tally]:
 
 
 def _agreement(asset: StoredAsset) -> tuple[float, tuple[float, ...]]:
-    """Return votes and spreads of merged labels, as in `Drawn`."""
+    """Return the ``votes`` and ``spreads`` of `Drawn`; NaN and () if labels are not merged."""
     if not asset.merged or not asset.valid.any():
         return np.nan, ()
     spread = np.ma.masked_invalid(asset.spread.astype(np.float64)).mean(axis=0)
@@ -112,7 +112,7 @@ def _agreement(asset: StoredAsset) -> tuple[float, tuple[float, ...]]:
 def thumbnail(asset: StoredAsset) -> NDArray[np.uint8]:
     """Draw the SLAT voxels of an asset from three directions, (SIDE, 3 * SIDE), in `palette`."""
     grid = np.zeros((RESOLUTION,) * 3, dtype=np.uint8)
-    # Of more classes some share a colour: a PNG's palette has 256.
+    # A PNG's palette has 256 colours, so classes beyond `CLASSES` share colours.
     colour = np.where(asset.material == UNANNOTATED, CLASSES, asset.material % CLASSES)
     cells, row = asset.cells
     grid[tuple(cells.T.astype(np.intp))] = 1 + colour[row]
@@ -161,12 +161,12 @@ def _brightness(depth: NDArray[np.intp], hit: NDArray[np.bool_]) -> NDArray[np.f
     """Return the brightness of each pixel by Lambert's law, 0..1."""
     from scipy.ndimage import uniform_filter
 
-    # Slopes are of an averaged depth: steps of whole voxels would show as stripes.
+    # Slopes come from an averaged depth: steps of whole voxels would show as stripes.
     weight = uniform_filter(hit.astype(np.float64), _SMOOTHING)
     smooth = uniform_filter(np.where(hit, depth, 0).astype(np.float64), _SMOOTHING)
     smooth /= np.maximum(weight, 1e-9)
     down, right = np.gradient(np.where(hit, smooth, 0.0))
-    # Beyond the outline there is no depth to compare with.
+    # At the outline there is no neighbouring depth to compare with.
     inside = uniform_filter(hit.astype(np.float64), 3) > 1.0 - 1e-9
     down, right = np.where(inside, down, 0.0), np.where(inside, right, 0.0)
     light = _LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]
@@ -175,20 +175,20 @@ def _brightness(depth: NDArray[np.intp], hit: NDArray[np.bool_]) -> NDArray[np.f
 
 
 def encode_asset(asset: StoredAsset, way: PlaceMap, side: int) -> bytes:
-    """Return an asset's voxels for the 3D view, in the form that this module describes.
+    """Return an asset's voxels for the 3D view, in the format that this module describes.
 
-    `way` maps between its frames. `side` is `FULL`, or `COARSE` for voxels of 2 x 2 x 2.
+    `way` maps between its frames. `side` is `FULL`, or `COARSE` for cells of 2 x 2 x 2 voxels.
     """
     cells, row = asset.cells
     first, occupied = _cells(cells, side)
     first = row[first]
     occupancy = asset.grid_material != asset.store.contents.background
-    surface = boundary(filled(occupancy)) & occupancy  # the outer one
+    surface = boundary(filled(occupancy)) & occupancy  # outer surface alone
     grid, material = np.argwhere(surface), asset.grid_material[surface]
     chosen, grid_occupied = _cells(grid, side)
     farthest = asset.store.about.build.parameters.sample.max_distance
     distance = asset.distance[first] / farthest
-    # Properties are NaN where not valid.
+    # Voxels that are not valid have NaN properties.
     scalars = np.column_stack([(asset.properties[first] + 1.0) / 2.0, distance])
     parts = [
         occupied,
@@ -207,7 +207,7 @@ def encode_asset(asset: StoredAsset, way: PlaceMap, side: int) -> bytes:
 
 
 def _cells(voxels: NDArray[np.integer], side: int) -> tuple[NDArray[np.intp], bytes]:
-    """Return the first voxel of each occupied cell, and the bits of all cells, in C order."""
+    """Return the index of the first voxel in each occupied cell, and occupancy bits, in C order."""
     cells = voxels.astype(np.intp) // (RESOLUTION // side)
     flat, first = np.unique(np.ravel_multi_index(tuple(cells.T), (side,) * 3), return_index=True)
     occupancy = np.zeros(side**3, dtype=bool)
@@ -216,7 +216,7 @@ def _cells(voxels: NDArray[np.integer], side: int) -> tuple[NDArray[np.intp], by
 
 
 def _quantised(share: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return shares 0..1 in `LEVELS` steps; NaN as `UNANNOTATED`."""
+    """Return shares in 0..1, quantised to `LEVELS` steps; NaN becomes `UNANNOTATED`."""
     known = np.isfinite(share)
     steps = np.round(np.clip(np.where(known, share, 0.0), 0.0, 1.0) * (LEVELS - 1))
     return np.where(known, steps, UNANNOTATED).astype(np.uint8)

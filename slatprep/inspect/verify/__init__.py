@@ -35,10 +35,10 @@ __all__ = ["Finding", "SourceRoots", "Verification", "verify_store"]
 
 SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share", "confidence",
           "expected_accuracy")  # fmt: skip
-"""Columns of shares and probabilities, 0 to 1."""
+"""Columns of shares and probabilities, in 0..1."""
 
 DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
-"""Columns of numbers of at least 0, or NaN where they are not defined."""
+"""Columns of numbers that are at least 0, or NaN if undefined."""
 
 WORDS = {
     words.__name__.lower(): tuple(map(str, words)) for words in (Engine, Model, Search, Verdict)
@@ -49,20 +49,20 @@ _LETTERS = "letters, digits, '.', '_' and '-'"
 _TEXTS = {
     "id": (ASSET_ID, _LETTERS),
     "object_id": (NAME, _LETTERS),
-    "view": (re.compile(f"({NAME.pattern})?"), _LETTERS),  # An object with one SLAT has no view.
+    "view": (re.compile(f"({NAME.pattern})?"), _LETTERS),  # Empty for an object with one SLAT.
     **{name: (re.compile("|".join(words)), f"one of {words}") for name, words in WORDS.items()},
 }
-"""What texts of a column may be, and that in words."""
+"""Pattern of the allowed texts of a column, and its description."""
 
 _NUMBERS = {
     **dict.fromkeys(SHARES, 1.0),
     **dict.fromkeys(DISTANCES, np.inf),
     "unphysical": RESOLUTION**3,
 }
-"""The largest number of a column; the smallest is 0."""
+"""Largest allowed number of a column; the smallest is 0."""
 
 _TOLERANCE = 1e-6
-"""What rounding leaves of the determinant of a rotation, which is 1."""
+"""Largest allowed difference of a rotation's determinant from 1, due to rounding."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ class Verification:
     assets : int
         Number of assets whose values were checked.
     files : int
-        Number of the store's files; all were compared with their digests.
+        Number of the store's files, all of them compared with their digests.
     sources : int
-        Number of source files whose digest was compared.
+        Number of source files whose digests were compared.
     manifests : Place or None
         Folder of the records that were compared; None if there are none.
     findings : tuple of Finding
@@ -126,7 +126,7 @@ def verify_store(
     jobs : int or Workers
         Worker processes, or a `slatprep.workers.dask.Cluster`.
     progress : callable, optional
-        Called with the number of assets done and the number of those to be compared.
+        Called with the number of assets done and the number of assets to compare.
 
     Returns
     -------
@@ -136,13 +136,13 @@ def verify_store(
     Raises
     ------
     StoreError
-        If the store does not exist, or `sources` is set and their roots are not known.
+        If the store does not exist, or `sources` is set and their roots are unknown.
     """
     path = storage_of(place_of(path)).current_version()
     try:
         store = open_store(path.absolute())  # Workers may run in another folder.
     except AttributesError:
-        # Without attributes values have no meaning; only metadata and files can be checked.
+        # Values have no meaning without attributes: only metadata and files can be checked.
         document = read_metadata(path / "zarr.json")
         files, found = file_findings(Store(path, document), jobs)
         findings = {*metadata_findings(path), *found}
@@ -192,7 +192,7 @@ def _chosen(total: int, sample: int | None) -> Sequence[int]:
 def _is_file(path: Place) -> bool:
     try:
         return path.is_file()
-    except OSError:  # An object store that does not answer.
+    except OSError:  # The object store does not answer.
         return False
 
 
@@ -200,7 +200,7 @@ def index_findings(store: Store) -> Iterator[Finding]:
     """Yield findings on the ``asset/*`` arrays."""
     ids = store.ids
     begins = store.attributes.get("segments")
-    if json.dumps(begins) != json.dumps(segments_of(ids)):  # True is 1, and 4.0 is 4
+    if json.dumps(begins) != json.dumps(segments_of(ids)):  # In Python, True == 1 and 4.0 == 4.
         what = f"attribute segments is {begins!r}"
         yield Finding("zarr.json", "", what, "the rows at which ids begin to ascend")
     known = set(ids[:1])

@@ -44,8 +44,8 @@ from slatprep.store.record_json import RecordError, columns_of, digest_of
 from slatprep.store.shard_reader import DamagedFileError
 
 CONFIDENCE_TOLERANCE = 1e-5
-"""Largest difference of probabilities, shares and normalised spreads: another machine may round
-sums differently."""
+"""Largest allowed difference of probabilities, shares and normalised spreads: machines may
+round sums differently."""
 
 
 def asset_findings(
@@ -53,7 +53,7 @@ def asset_findings(
 ) -> tuple[list[Finding], int]:
     """Return the faults of an asset of a store, and the number of its sources compared.
 
-    Sources are compared if `roots` is given.
+    Sources are compared only if `roots` is given.
     """
     asset_id, findings, compared = source.ids[row], list[Finding](), 0
     where, expected = "asset", "an asset that can be read"
@@ -64,7 +64,7 @@ def asset_findings(
         where, expected = RECORD_ARRAY, "a record for each row"
         record = source.records.read(row)
         findings += record_findings(asset, record, source.text(row))
-        if sound:  # From invalid values no confidence can be computed.
+        if sound:  # Confidence cannot be computed from invalid values.
             findings += confidence_findings(asset, record)
         if roots is not None:
             where, expected = "sources", "those that the store was made from"
@@ -120,7 +120,7 @@ def value_findings(asset: StoredAsset) -> Iterator[Finding]:
 
 
 def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
-    """Yield findings where the annotation differs from what grid and places give."""
+    """Yield findings where the annotation differs from a new lookup by grid and places."""
     try:
         _, differences = recompute_annotation(asset)
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
@@ -134,14 +134,14 @@ def lookup_findings(asset: StoredAsset) -> Iterator[Finding]:
 def _voxel_findings(
     asset: StoredAsset, where: str, fine: NDArray[np.bool_], expected: str
 ) -> Iterator[Finding]:
-    """Yield a finding unless all values (N, ...) of the voxels are fine; comparisons refuse NaN."""
+    """Yield a finding unless `fine` (N, ...) is true for all voxels."""
     wrong = np.count_nonzero(~fine.all(axis=tuple(range(1, fine.ndim))))
     if wrong:
         yield Finding(where, asset.asset_id, f"{wrong} of {len(fine)} voxels differ", expected)
 
 
 def fault_findings(where: str, asset_id: str, error: RecordError) -> list[Finding]:
-    """Return the faults of a record that cannot be read, at most three."""
+    """Return at most three faults of a record that cannot be read."""
     return [Finding(where, asset_id, fault, "the published schema") for fault in error.faults[:3]]
 
 
@@ -169,17 +169,17 @@ def record_findings(asset: StoredAsset, record: AssetRecord, text: bytes) -> Ite
 
 
 def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Finding]:
-    """Yield a finding where ``voxel/confidence`` differs from what grid and record give."""
+    """Yield a finding if ``voxel/confidence`` differs from its value by grid and record."""
     if asset.merged:
         return
     field, properties = asset.normalised_field, asset.properties
-    if not field.classified:  # Otherwise the confidence comes from classes alone.
+    if not field.classified:  # With classes, the confidence comes from classes alone.
         if asset.store.cached_column("clipped_grid")[asset.index].any():
             return  # The confidence came from values that the store does not hold.
         field, properties = asset.field, asset.properties_si
     annotation = Annotation(properties, asset.material, asset.valid, asset.distance, asset.place)
     if not labels_hold(field, annotation, roundings(asset.store.normalization)):
-        return  # It may have come from other labels than the rounded values have.
+        return  # The confidence may come from other labels than the rounded values give.
     confidence = record.judgement.confidence
     likely = voxel_confidence(field, asset.latents, record.alignment, annotation, confidence)
     fine = np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE
@@ -224,7 +224,7 @@ def source_findings(
 def merged_findings(
     asset: StoredAsset, record: AssetRecord, roots: SourceRoots
 ) -> Iterator[Finding]:
-    """Yield findings where merged labels differ from what sources and recorded alignments give."""
+    """Yield findings where merged labels differ from a new merge by sources and alignments."""
     latents, contents = asset.latents, asset.store.contents
     parts = []
     for one in record.merged:
@@ -257,7 +257,7 @@ def merged_findings(
 def _pair_of(
     asset: StoredAsset, record: AssetRecord, one: Contribution, roots: SourceRoots
 ) -> AssetPair:
-    """Return where the files of one annotation are now."""
+    """Return the pair of one annotation, with the present places of its files."""
     found = [record.sources[k] for k in one.sources]
     own = (roots, *roots.also)[found[0].source]
     files = {file.role: own.pixieverse / file.path for file in found}
@@ -279,10 +279,10 @@ def _pair_of(
 
 
 def roundings(normalization: Normalization) -> NDArray[np.float64]:
-    """Return how far a mapped property (P,) that went through the store may be off.
+    """Return the largest rounding error (P,) of a mapped property that went through the store.
 
-    Rounding to float32 happens twice, normalised and in SI units, each by at most 2**-24 of the
-    value. The exponent of a power of ten moves by less than half as much.
+    Values are rounded to float32 twice, normalised and in SI units, each by at most 2**-24 of the
+    value. If a property is mapped by log10, its exponent changes by less than half of that.
     """
     spans = normalization.ranges
     own = [0.5 if span.log10 else max(abs(span.lo), abs(span.hi)) for span in spans]
@@ -291,26 +291,26 @@ def roundings(normalization: Normalization) -> NDArray[np.float64]:
 
 
 def _is_spread(asset: StoredAsset) -> bool:
-    """Whether spreads are at least 0, and only of merged labels."""
+    """Return whether spreads are at least 0, and NaN unless labels are merged and valid."""
     missing = np.isnan(asset.spread)
     may = asset.valid & asset.merged
     return bool(missing[~may].all() and (missing | (asset.spread >= 0)).all())
 
 
 def _normalised(values: NDArray[np.float32], where: NDArray[np.bool_]) -> bool:
-    """Whether values (..., rows) are in [-1, 1] where the mask is true and NaN elsewhere."""
+    """Return whether values (..., rows) are in [-1, 1] where the mask is true, else NaN."""
     there = values.reshape(-1, where.size)[:, np.flatnonzero(where)]
     missing = np.count_nonzero(np.isnan(values))
     return bool((np.abs(there) <= 1).all()) and missing == values.size - there.size
 
 
 def _claims(asset: StoredAsset, record: AssetRecord) -> Iterator[tuple[str, object, object]]:
-    """Yield the name of each entry that both have, its value in the record and in the store."""
+    """Yield name, value in the record and value in the store of each entry that both have."""
     store = asset.store
     yield "asset_id", record.asset_id, asset.asset_id
     columns = columns_of(record)
     change = columns["property_ambiguity"]
-    # A faulty record may have another number of properties.
+    # A faulty record may have a wrong number of properties.
     if len(change) == len(store.normalization.ranges):
         columns["property_ambiguity"] = normalize_change([change], store.normalization)[0]
     for name, column in columns.items():
@@ -331,7 +331,7 @@ def _claims(asset: StoredAsset, record: AssetRecord) -> Iterator[tuple[str, obje
 
 
 def _equal(said: object, held: object) -> bool:
-    """Whether values or arrays are equal; a single NaN is that of all channels."""
+    """Return whether values or arrays are equal; a scalar is compared with every channel."""
     one, other = np.asarray(said), np.asarray(held)
     if one.ndim and one.shape != other.shape:
         return False
@@ -340,6 +340,6 @@ def _equal(said: object, held: object) -> bool:
 
 @lru_cache(maxsize=64)
 def _digest(path: Place, _store: SourceStore) -> str:
-    # Cached, since one file may hold the SLATs of many assets; as long as the store is verified,
-    # since files may have changed since an earlier run.
+    # Cached, because one file may hold the SLATs of many assets. The store is part of the cache's
+    # key, because files may change between two verifications.
     return file_digest(path)

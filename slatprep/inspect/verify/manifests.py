@@ -29,9 +29,9 @@ _OWN = "the store's: name the folder of its records with --manifests, or build a
 
 
 def source_roots(manifests: Place | None) -> SourceRoots:
-    """Return the roots of the sources when the store was built.
+    """Return the roots of the sources at the time of the build.
 
-    Raises StoreError if no record names them, or they do not exist any more.
+    Raises StoreError if no record names them, or they no longer exist.
     """
     advice = "name the roots with --pixieverse and --slat"
     if manifests is None:
@@ -60,11 +60,11 @@ def source_roots(manifests: Place | None) -> SourceRoots:
 
 
 def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
-    """Return roots that were moved since the build, read as its record says."""
+    """Return moved roots, with adapters, units and plausibility as the build's record says."""
     try:
         build = None if manifests is None else build_in(manifests).parameters
     except StoreError:
-        build = None  # It is named with the records.
+        build = None  # `manifest_findings` reports the fault.
     if build is None:
         return roots
     sources = zip((roots, *roots.also), (build.pixieverse, *build.also), strict=False)
@@ -84,9 +84,9 @@ def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
 def manifest_findings(
     store: Store, folder: Place, rows: Sequence[int] | None = None
 ) -> Iterator[Finding]:
-    """Yield findings where the manifests are not what the store's records give.
+    """Yield findings where the manifests differ from the store's records.
 
-    With a sample of rows, files of lines that hold none of them are not read.
+    With a sample of rows, files of lines without any of these rows are not read.
     """
     names = file_names(len(store))
     if rows is not None:
@@ -110,7 +110,7 @@ def manifest_findings(
         try:
             claims = [claim for claim in _claims(build, store) if claim[1] != claim[2]]
         except StoreError:
-            claims = []  # A column is damaged, which is told of its file.
+            claims = []  # A column is damaged; a finding on its file reports it.
         for name, said, held in claims:
             yield Finding(file, "", f"{name} is {said!r}", f"{held!r}, as the store has")
     for name in names:
@@ -118,7 +118,7 @@ def manifest_findings(
 
 
 def _claims(build: BuildRecord, store: Store) -> Iterator[tuple[str, object, object]]:
-    """Yield the name of each entry that the store tells too, its value here and there."""
+    """Yield name, value in the record and value in the store of each entry that both have."""
     counts = counts_in(store)
     yield "verdicts", build.verdicts, counts["verdicts"]
     ok = build.statuses.get(str(Status.OK))
@@ -134,12 +134,12 @@ def _claims(build: BuildRecord, store: Store) -> Iterator[tuple[str, object, obj
 
 
 def _line_findings(store: Store, file: Place, shard: int) -> Iterator[Finding]:
-    """Yield the first lines of a file that are not those of its shard of records."""
+    """Yield findings on the first lines of a file that differ from its shard of records."""
     try:
         expected = lines_of(store, shard)
         found = storage_of(file).read(len(expected))
     except StoreError:
-        return  # The shard of records is damaged, which is told of its file.
+        return  # The shard of records is damaged; a finding on its file reports it.
     except OSError as error:
         yield Finding(str(file), "", f"cannot be read ({error.strerror})", "records, a line each")
         return
