@@ -12,7 +12,6 @@ import math
 import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -238,11 +237,16 @@ def _hash_shared(descriptor: int, name: str) -> SourceFile:
     """Describe an open file that many assets share; its hash is computed once a process."""
     state = os.fstat(descriptor)
     known = state.st_dev, state.st_ino, state.st_mtime_ns, state.st_ctime_ns, state.st_size
-    return SourceFile("slat", name, state.st_size, _sha256(descriptor, known))
+    if known not in _DIGESTS:
+        _DIGESTS[known] = _sha256(descriptor)
+    return SourceFile("slat", name, state.st_size, _DIGESTS[known])
 
 
-@lru_cache(maxsize=64)
-def _sha256(descriptor: int, known: tuple[int, ...]) -> str:
+_DIGESTS: dict[tuple[int, ...], str] = {}
+"""SHA-256 by state of each shared file that this process has hashed."""
+
+
+def _sha256(descriptor: int) -> str:
     digest, at = hashlib.sha256(), 0
     while block := os.pread(descriptor, 2**20, at):  # pread leaves HDF5's position alone
         digest.update(block)

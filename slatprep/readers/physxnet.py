@@ -99,7 +99,9 @@ _KEYS: dict[str, tuple[str, float, dict[str, float]]] = {
 """Key of each property, and factors to SI units of a bare number and of units behind a number."""
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", re.S)
-_MAX_PARTS = 1000
+
+_MAX_PARTS = 250
+"""Largest number of an object's parts and of its meshes, as a record holds 256 files."""
 
 
 class Parts(SourceAdapter):
@@ -115,7 +117,16 @@ class Parts(SourceAdapter):
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Find the fields by the names of their JSON files."""
         for found in super().find(source, listing):
-            yield replace(found, beside=tuple(_meshes_of(found.object_id, listing).values()))
+            beside: tuple[str, ...] = ()
+            problem = found.problem
+            try:
+                beside = tuple(_meshes_of(found.object_id, listing).values())
+            except OSError as error:
+                problem = problem or f"{error.filename}: cannot be listed ({error.strerror})"
+            if len(beside) > _MAX_PARTS:
+                many = f"{found.path} has {len(beside)} meshes"
+                problem = problem or f"{many}; expected at most {_MAX_PARTS}"
+            yield replace(found, beside=beside, problem=problem)
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""

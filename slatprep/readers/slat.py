@@ -44,7 +44,11 @@ def _textures_of(shapes: Place) -> Place:
     model, home = shapes.name, shapes.parent
     textures = home.parent / "pbr_latents"
     like = "".join(model.rpartition("_")[1:])  # such as _1024
-    folders = storage_of(textures).names()[1] if home.name == "shape_latents" else []
+    try:
+        folders = storage_of(textures).names()[1] if home.name == "shape_latents" else []
+    except OSError as error:
+        fault = f"cannot be listed ({error.strerror})"
+        raise InputError(textures, fault, "the folder of texture latents") from None
     found = [name for name in folders if name.endswith(like)]
     if len(found) != 1:
         wanted = (

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from slatprep.learn.dataset import SlatDataset
 from slatprep.learn.predict import load_checkpoint, predict
 from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.seen import look
 from slatprep.readers import discover, read_latents
 from slatprep.records import FEATS_MEAN, FEATS_STD, StructuredLatents
 from slatprep.store.integrity import metadata_findings
@@ -178,12 +180,19 @@ def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
     np.testing.assert_array_equal(open_store(out).asset("a").feats, both["a"])
 
 
+def loop_at(folder: Path) -> None:
+    """Put a link to itself in place of a folder: it is there, and nobody can list it."""
+    folder.rename(folder.with_name("away"))
+    folder.symlink_to(folder.name)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda path: path.unlink(), "does not exist"),
         (lambda path: path.parent.rename(path.parents[1] / "tex_512"), "0 folders of texture"),
         (lambda path: (path.parents[1] / "other_1024").mkdir(), "2 folders of texture"),
+        (lambda path: loop_at(path.parents[1]), r"pbr_latents: cannot be listed \("),
         (
             lambda path: np.savez(path, coords=[[1, 2, 3]], feats=np.zeros((1, 32), np.float32)),
             "has other voxels than a.npz of the shape",
@@ -193,5 +202,7 @@ def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
 def test_texture_latents_that_do_not_belong_are_refused(dataset, change, words):
     write_both(dataset)
     change(dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz")
+    pairs = discover(of_both(dataset))
     with pytest.raises(InputError, match=words):
-        read_latents(discover(of_both(dataset))[0])
+        read_latents(pairs[0])
+    assert len(look(pairs)) == len(pairs)

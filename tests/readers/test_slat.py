@@ -94,6 +94,14 @@ def test_shared_file_is_hashed_again_when_it_changed_in_the_same_tick(make_pair)
     assert read_latents(pair).sources[0].sha256 != before
 
 
+def test_shared_file_is_hashed_once_under_whatever_number_it_is_opened(make_pair, monkeypatch):
+    pair = hdf5_pair(make_pair(), "a", coords=COORDS, feats=FEATS)
+    before = read_latents(pair).sources
+    monkeypatch.setattr(hashlib, "sha256", None)
+    with pair.slat.open("rb"):  # which takes the number that the file had
+        assert read_latents(pair).sources == before
+
+
 OUT = "coordinate ({}) in row {} is out of range"
 BAD_ARRAYS = [
     ({"coords": COORDS[:, :2]}, "shape (3, 2)", "(N <= 262144, 3)"),

@@ -21,6 +21,7 @@ from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.readers.adapters import find_grids
 from slatprep.readers.files import load_source
 from slatprep.records import Engine
 from slatprep.store import open_store
@@ -343,6 +344,23 @@ def test_parts_that_are_none_are_named(key, value, said, tmp_path):
         mesh.unlink() if value is None else mesh.write_text(value)
     with pytest.raises(InputError, match=said):
         field_at(root, "parts")
+
+
+def test_an_object_whose_meshes_cannot_be_found_stops_no_other(tmp_path):
+    root = write_object(tmp_path, [(HEAD, cuboid(*CUBE))])
+    objects = root / "partseg"
+    for name in "bc":
+        shutil.copy(root / "finaljson" / "a.json", root / "finaljson" / f"{name}.json")
+        (objects / name).mkdir()
+    (objects / "b" / "objs").symlink_to("objs")  # a link to itself
+    (objects / "c" / "objs").mkdir()
+    for part in range(251):
+        (objects / "c" / "objs" / f"{part}.obj").touch()
+    found = find_grids(PixieverseSource(root, adapter="parts"))
+    problems = {name: one.problem for name, (one,) in found.items()}
+    assert problems.keys() == set("abc") and problems["a"] == ""
+    assert "partseg/b/objs/: cannot be listed (" in problems["b"]
+    assert problems["c"] == "finaljson/c.json has 251 meshes; expected at most 250"
 
 
 def known_build(root: Path, adapter: str, coords: np.ndarray) -> tuple[BuildParameters, Path]:
