@@ -35,7 +35,7 @@ from slatprep.align.pair import TIE
 from slatprep.judge import calibration
 from slatprep.judge.confidence import voxel_figures
 from slatprep.judge.evidence import FIGURES, HARMLESS, VOXEL_FIGURES, Surroundings
-from slatprep.judge.model import Figure, Logistic
+from slatprep.judge.model import Logistic, Term
 from slatprep.judge.verdict import THRESHOLDS
 
 PRIOR = {"own": 0.945, "heading": 0.005, "other": 0.05}
@@ -181,7 +181,7 @@ def fit(
     options = {"maxiter": 5_000, "maxfun": 20_000, "ftol": 1e-13, "gtol": 1e-9}
     found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B", options=options).x
     figures = tuple(
-        Figure(name, *(float(f"{v:.6g}") for v in (w / s, u, a, b)))
+        Term(name, *(float(f"{v:.6g}") for v in (w / s, u, a, b)))
         for name, w, s, u, a, b in zip(names, found[:-1], spread, usual, low, high, strict=True)
     )
     counted = tuple(figure for figure in figures if figure.weight)
@@ -416,12 +416,12 @@ def write_numbers(path: Path, models: Models) -> None:
 
 
 def _written(model: Logistic) -> str:
-    figures, curve = (
+    terms, curve = (
         "[{}]".format(",".join(f"\n      {json.dumps(row)}" for row in rows))
-        for rows in (map(astuple, model.figures), model.curve)
+        for rows in (map(astuple, model.terms), model.curve)
     )
     return (
-        f'{{\n    "intercept": {model.intercept},\n    "figures": {figures},\n'
+        f'{{\n    "intercept": {model.intercept},\n    "terms": {terms},\n'
         f'    "curve": {curve}\n  }}'
     )
 

@@ -24,7 +24,7 @@ from slatprep.records import (
 )
 
 if TYPE_CHECKING:
-    from slatprep.geometry.nearest import Lattice
+    from slatprep.geometry.nearest import VoxelIndex
 
 NEAR_POWER, NEAR_SHARE = float(np.log10(2.0)), 0.2
 """Largest deviation from the merged property that counts as the same: a factor of two (in log10),
@@ -50,16 +50,16 @@ def sample(
     [voxel] is to the voxel whose values were taken. For a voxel that is not valid it is to the
     nearest, or infinite with `labels_alone`, which is faster.
     """
-    lattice = lattice_of(field)
+    voxels = voxel_index_of(field)
     place = np.asarray(places, dtype=np.float32)
     points = place.astype(np.float64)
     limit = parameters.max_distance * (1.0 + 1e-12) if labels_alone else np.inf
     if parameters.method == "vote":
-        distance, used, valid = lattice.voted(
+        distance, used, valid = voxels.voted(
             points, field.material, parameters.vote_width, parameters.max_distance, limit
         )
     else:
-        distance, used = lattice.nearest(points, limit)
+        distance, used = voxels.nearest(points, limit)
         valid = distance <= parameters.max_distance
     properties, material = field.properties.take(used, axis=0), field.material.take(used)
     properties[~valid] = np.nan
@@ -68,11 +68,11 @@ def sample(
 
 
 @lru_cache(maxsize=1)
-def lattice_of(field: MaterialField) -> Lattice:
-    """Return the lattice of the field's annotated voxels, cached for repeated lookups."""
-    from slatprep.geometry.nearest import Lattice
+def voxel_index_of(field: MaterialField) -> VoxelIndex:
+    """Return the index of the field's annotated voxels, cached for repeated lookups."""
+    from slatprep.geometry.nearest import VoxelIndex
 
-    return Lattice(field.voxels)
+    return VoxelIndex(field.voxels)
 
 
 def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annotation:

@@ -24,7 +24,7 @@ _MOST = 4.0
 """Upper limit, in voxels, of the difference in a direction."""
 
 _AXES = np.array([axes for axes in product((-1.0, 0.0, 1.0), repeat=3) if any(axes)])
-DIRECTIONS: Array = _AXES / np.linalg.norm(_AXES, axis=1, keepdims=True)
+UNIT_DIRECTIONS: Array = _AXES / np.linalg.norm(_AXES, axis=1, keepdims=True)
 """The 26 directions of a cube's faces, edges and corners."""
 
 
@@ -59,8 +59,8 @@ def shares_within(apart: Array, *limits: float) -> tuple[float, float, float]:
 
 def _by_direction(apart: Array, normals: Array) -> tuple[Array, Array, NDArray[np.intp]]:
     """Return the 0.3 quantile and the median of `apart`, and the sample count, by direction."""
-    groups = np.argmax(normals @ DIRECTIONS.T, axis=1)
-    counts = np.bincount(groups, minlength=len(DIRECTIONS))
+    groups = np.argmax(normals @ UNIT_DIRECTIONS.T, axis=1)
+    counts = np.bincount(groups, minlength=len(UNIT_DIRECTIONS))
     if counts.max() < _LEAST:
         groups, counts = np.zeros_like(groups), np.array([len(apart)])
     order, first = _sorted_by(groups, apart, counts)

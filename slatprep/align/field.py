@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from slatprep.align.deform import CLEAN, Deformed
 from slatprep.align.figures import measure_figures
 from slatprep.align.finish import as_free, finish, rank_of
-from slatprep.align.ground import LEAST_ABOVE, LEAST_GAIN, RAISED, find_layers, gain, raised
+from slatprep.align.ground import GROUND_GAIN, LEAST_ABOVE, RAISED, find_layers, gain, raised
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE_SAMPLES, COARSE_TAUS, MOST_SURVIVORS, TIE, Pair
 from slatprep.align.pose import Pose, Similarity
@@ -91,7 +91,7 @@ def align(
 
 def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignment:
     """Return the best alignment without a flat layer if it is clearly better, else `found`."""
-    best, most = found, LEAST_GAIN
+    best, most = found, GROUND_GAIN
     for ground in (raised(layer, by) for layer in find_layers(pair.pixie) for by in RAISED):
         solid = above(field.occupancy, ground)
         if np.count_nonzero(solid) < LEAST_ABOVE * np.count_nonzero(field.occupancy):

@@ -45,7 +45,7 @@ LEAST_ABOVE = 0.05
 RAISED = (0.0, 1.0, 2.0)
 """Heights of the cut above a layer's top, in voxels: ground is rough, and objects stand in it."""
 
-LEAST_GAIN = 0.05
+GROUND_GAIN = 0.05
 """Rise of the score without a layer above which the layer is ground."""
 
 

@@ -43,16 +43,16 @@ def compare(
     meet, and the boundary of a solid has none there. A partner farther away than `radius` (voxels
     of the SLAT frame) is no inlier.
     """
-    from slatprep.geometry.nearest import Lattice
+    from slatprep.geometry.nearest import VoxelIndex
 
     # Both ways the points are carried to the other side's lattice, where the nearest voxel is found
     # without a tree. The scale converts distances in the PixieVerse frame to voxels of the SLAT
     # frame.
     _, _, scale = split_transform(transform)
     carried = apply_transform(transform, voxel_centres(pixieverse))
-    forward, _ = Lattice(slat).nearest(carried, limit=radius)
+    forward, _ = VoxelIndex(slat).nearest(carried, limit=radius)
     carried = apply_transform(invert_transform(transform), voxel_centres(slat))
-    backward, _ = Lattice(pixieverse).nearest(carried, limit=radius / scale)
+    backward, _ = VoxelIndex(pixieverse).nearest(carried, limit=radius / scale)
     near, near_back = np.isfinite(forward), np.isfinite(backward)
     return Quality(
         fitness=float(near.mean()),

@@ -72,6 +72,49 @@ def _rotation_of(turn):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def _sum_equations(slat, pixie, links, centre, tau, size_by_slat, equations, normal, rhs):  # type: ignore[no-untyped-def]
+    """Write the normal equations of both sides' residuals to `normal` and `rhs`."""
+    products = equations.products
+    products[:] = 0.0
+    accumulate(slat, pixie, links[0], centre, tau, 1.0, SIMILARITY, equations)
+    by_slat = products.copy() if size_by_slat else products
+    accumulate(pixie, slat, links[1], centre, tau, 1.0, SIMILARITY, equations)
+    if size_by_slat:
+        products[6:, 6:] = 2.0 * by_slat[6:, 6:]
+    matrix_and_rhs(products, SIMILARITY, normal, rhs)
+    if size_by_slat:
+        for i in range(6, SIMILARITY):
+            normal[i, :6] = 2.0 * by_slat[:6, i]
+
+
+@kernel()
+def _regularise(normal, rhs, offset, samples, free_scale):  # type: ignore[no-untyped-def]
+    """Hold the offset near 0 and, unless it is free, the scale where it is; damp all unknowns."""
+    # On a ball, offset and scale have the same effect, so a weak prior keeps the
+    # offset near 0. A little damping (below) keeps a plane from sliding.
+    normal[7, 7] += _OFFSET_PRIOR * samples
+    rhs[7] -= _OFFSET_PRIOR * samples * offset
+    if not free_scale:
+        normal[:, 6] = 0.0
+        normal[6, :] = 0.0
+        rhs[6] = 0.0
+    for i in range(SIMILARITY):
+        normal[i, i] += 1e-4 * normal[i, i] + 1e-6 * samples
+
+
+@kernel()
+def _move(rotation, shift, step, growth, centre):  # type: ignore[no-untyped-def]
+    """Turn and shift a pose in place by a step, and grow it about the centre."""
+    turn = _rotation_of(step)
+    away = _product(turn, shift[0] - centre[0], shift[1] - centre[1], shift[2] - centre[2])
+    for axis in range(3):
+        shift[axis] = centre[axis] + growth * away[axis] + step[3 + axis]
+    for axis in range(3):
+        x, y, z = rotation[0, axis], rotation[1, axis], rotation[2, axis]
+        rotation[0, axis], rotation[1, axis], rotation[2, axis] = _product(turn, x, y, z)
+
+
+@kernel()
 def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tolerance):  # type: ignore[no-untyped-def]
     """Refine `Poses` of the PixieVerse surface on the SLAT surface, both `Samples`, in place.
 
@@ -88,7 +131,6 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
     scale_low, scale_high = scale_bounds
     samples = len(slat.values) + len(pixie.values)
     equations = new_equations()
-    products = equations.products
     normal, rhs = np.zeros((SIMILARITY, SIMILARITY)), np.zeros(SIMILARITY)
     step = np.zeros(SIMILARITY)
     memory = np.empty((3, 3)), np.empty((3, 3)), -np.eye(3), np.empty(3)
@@ -97,27 +139,9 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
         rotation, shift = poses.rotations[pose], poses.shifts[pose]
         scale, offset = poses.scales[pose], poses.offsets[pose]
         for tau in taus:
-            there, here = _links(rotation, shift, scale, offset, memory)
-            products[:] = 0.0
-            accumulate(slat, pixie, there, centre, tau, 1.0, SIMILARITY, equations)
-            by_slat = products.copy() if size_by_slat else products
-            accumulate(pixie, slat, here, centre, tau, 1.0, SIMILARITY, equations)
-            if size_by_slat:
-                products[6:, 6:] = 2.0 * by_slat[6:, 6:]
-            matrix_and_rhs(products, SIMILARITY, normal, rhs)
-            if size_by_slat:
-                for i in range(6, SIMILARITY):
-                    normal[i, :6] = 2.0 * by_slat[:6, i]
-            # On a ball, offset and scale have the same effect, so a weak prior keeps the
-            # offset near 0. A little damping (below) keeps a plane from sliding.
-            normal[7, 7] += _OFFSET_PRIOR * samples
-            rhs[7] -= _OFFSET_PRIOR * samples * offset
-            if not free_scale:
-                normal[:, 6] = 0.0
-                normal[6, :] = 0.0
-                rhs[6] = 0.0
-            for i in range(SIMILARITY):
-                normal[i, i] += 1e-4 * normal[i, i] + 1e-6 * samples
+            links = _links(rotation, shift, scale, offset, memory)
+            _sum_equations(slat, pixie, links, centre, tau, size_by_slat, equations, normal, rhs)
+            _regularise(normal, rhs, offset, samples, free_scale)
             solve_linear(normal, rhs, step)
             angle = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
             if angle > _LONGEST_TURN:
@@ -125,13 +149,7 @@ def solve(slat, pixie, poses, taus, free_scale, size_by_slat, scale_bounds, tole
                 angle = _LONGEST_TURN
             growth = math.exp(min(max(step[6], -_LARGEST_GROWTH), _LARGEST_GROWTH))
             growth = min(max(growth, scale_low / scale), scale_high / scale)
-            turn = _rotation_of(step)
-            away = _product(turn, shift[0] - centre[0], shift[1] - centre[1], shift[2] - centre[2])
-            for axis in range(3):
-                shift[axis] = centre[axis] + growth * away[axis] + step[3 + axis]
-            for axis in range(3):
-                x, y, z = rotation[0, axis], rotation[1, axis], rotation[2, axis]
-                rotation[0, axis], rotation[1, axis], rotation[2, axis] = _product(turn, x, y, z)
+            _move(rotation, shift, step, growth, centre)
             scale *= growth
             offset += step[7]
             moved = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)

@@ -54,7 +54,7 @@ def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
     to `poses`. Return each pose's mean kernel at tau = 1 voxel, with equal weight for both sides.
     If a step takes the determinant beyond its limits, undo it, stop, and set the score to 0.
     """
-    here, back = len(slat.values), len(pixie.values)
+    n_slat, n_pixie = len(slat.values), len(pixie.values)
     equations, normal, rhs = new_equations(), np.zeros((AFFINE, AFFINE)), np.zeros(AFFINE)
     step, inverse, centre = np.zeros(AFFINE), np.zeros((3, 3)), centre_of(slat)
     scores = np.zeros(len(poses.scales))
@@ -62,7 +62,7 @@ def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
         rotation, shift, scale = poses.rotations[pose], poses.shifts[pose], poses.scales[pose]
         affine, before = affines[pose], affines[pose].copy()
         offset = poses.offsets[pose]
-        for turn in range(len(taus) + 1):
+        for step_number in range(len(taus) + 1):
             sound = _LEAST < invert(affine, inverse) < _MOST
             if not (sound and math.isfinite(poses.offsets[pose])):
                 affine[:] = before
@@ -70,13 +70,13 @@ def stretch(slat, pixie, poses, affines, taus):  # type: ignore[no-untyped-def]
                 break
             offset = poses.offsets[pose]
             forward, backward = _links(rotation, shift, scale, offset, affine, inverse)
-            if turn == len(taus):
-                ours = fit_of(slat, pixie, forward, equations)[0] / here
-                theirs = fit_of(pixie, slat, backward, equations)[0] / back
+            if step_number == len(taus):
+                ours = fit_of(slat, pixie, forward, equations)[0] / n_slat
+                theirs = fit_of(pixie, slat, backward, equations)[0] / n_pixie
                 scores[pose] = 0.5 * (ours + theirs)
                 break
             before[:] = affine
-            tau, count = taus[turn], here + back
+            tau, count = taus[step_number], n_slat + n_pixie
             equations.products[:] = 0.0
             accumulate(slat, pixie, forward, centre, tau, 1.0, AFFINE, equations)
             accumulate(pixie, slat, backward, centre, tau, PIXIEVERSE_WEIGHT, AFFINE, equations)

@@ -25,7 +25,7 @@ _BLOCK = 4  # cells along an edge of a block, which is skipped as a whole
 _ROUNDING = 1e-6  # voxels; slack of a bound, so that rounding skips no voxel
 
 
-class Lattice:
+class VoxelIndex:
     """A set of voxels (K, 3), K >= 1, with the row of the voxel in each cell of the grid."""
 
     def __init__(self, voxels: NDArray[np.uint8]) -> None:

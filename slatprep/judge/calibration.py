@@ -7,7 +7,7 @@ from pathlib import Path
 import orjson
 
 from slatprep.judge.evidence import FIGURES, VOXEL_FIGURES
-from slatprep.judge.model import Figure, Logistic
+from slatprep.judge.model import Logistic, Term
 
 NUMBERS = Path(__file__).with_suffix(".json")
 """The file of the numbers."""
@@ -16,7 +16,7 @@ NUMBERS = Path(__file__).with_suffix(".json")
 def _model(name: str, names: tuple[str, ...]) -> Logistic:
     held = orjson.loads(NUMBERS.read_bytes())[name]
     curve = tuple((odds, share) for odds, share in held["curve"])
-    return Logistic(names, tuple(Figure(*one) for one in held["figures"]), held["intercept"], curve)
+    return Logistic(names, tuple(Term(*one) for one in held["terms"]), held["intercept"], curve)
 
 
 SAME_OBJECT = _model("same_object", FIGURES)

@@ -32,7 +32,7 @@ Range = tuple[float, float]
 FOLDS, ROUNDS = 3, 3
 """Number of parts of the objects, each scored by a fit to the others, and of rounds of fits."""
 
-SURE = 0.01
+RIGHT_BELOW = 0.01
 """Largest rate of errors up to which a fit treats targets as right."""
 
 RIDGE = 3.0
@@ -202,7 +202,7 @@ def _refitted(
     for _ in range(ROUNDS):
         rated = _rates(scores[~decoy], scores[decoy], 1.0)
         sure = np.zeros(len(both), dtype=bool)
-        sure[: len(targets)] = rated <= SURE
+        sure[: len(targets)] = rated <= RIGHT_BELOW
         found = scores.copy()
         for fold in np.unique(folds):
             seen = folds != fold

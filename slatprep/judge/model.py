@@ -15,7 +15,7 @@ one."""
 
 
 @dataclass(frozen=True)
-class Figure:
+class Term:
     """One figure of a model: clipped to `low`..`high`, less `usual`, times `weight`.
 
     ``usual`` is the mean over right samples, within the same bounds. So the product is what the
@@ -38,7 +38,7 @@ class Logistic:
     ----------
     names : tuple of str
         Names of the columns of values, in their order.
-    figures : tuple of Figure
+    terms : tuple of Term
         Terms of the model; terms of one name are adjacent.
     intercept : float
         Logarithm of the odds if all figures are as usual.
@@ -47,17 +47,17 @@ class Logistic:
     """
 
     names: tuple[str, ...] = field(repr=False)
-    figures: tuple[Figure, ...]
+    terms: tuple[Term, ...]
     intercept: float
     curve: tuple[tuple[float, float], ...]
 
     @cached_property
     def _columns(self) -> NDArray[np.intp]:
-        return np.array([self.names.index(figure.name) for figure in self.figures])
+        return np.array([self.names.index(term.name) for term in self.terms])
 
     @cached_property
     def _table(self) -> NDArray[np.float64]:
-        return np.array([(f.weight, f.usual, f.low, f.high) for f in self.figures]).T
+        return np.array([(f.weight, f.usual, f.low, f.high) for f in self.terms]).T
 
     def contributions(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return what each figure (..., F) adds to the logarithm of the odds; NaN adds nothing."""

@@ -32,9 +32,9 @@ from slatprep.records import (
     MaterialField,
     StructuredLatents,
 )
-from slatprep.sample import lattice_of, sample
+from slatprep.sample import sample, voxel_index_of
 
-PARTS = 5
+FOLDS = 5
 """Number of parts of a dataset, by object; a model of the others judges each part."""
 
 DECISIVE = 0.95
@@ -157,9 +157,9 @@ class Reliability:
     least_gain: float
 
 
-def part_of(object_id: str) -> int:
-    """Return the part of the dataset, 0..PARTS - 1, that an object belongs to."""
-    return int(hashlib.sha256(object_id.encode()).hexdigest()[:8], 16) % PARTS
+def fold_of(object_id: str, folds: int = FOLDS) -> int:
+    """Return which part of the dataset, 0..folds - 1, an object belongs to."""
+    return int(hashlib.sha256(object_id.encode()).hexdigest()[:8], 16) % folds
 
 
 def moments_of(
@@ -183,11 +183,11 @@ def fit_models(moments: Iterable[tuple[str, Moments]]) -> list[LatentModel] | No
     """
     sums: dict[int, Moments] = {}
     for object_id, some in moments:
-        part = part_of(object_id)
-        sums[part] = sums[part] + some if part in sums else some
+        fold = fold_of(object_id)
+        sums[fold] = sums[fold] + some if fold in sums else some
     models = []
-    for part in range(PARTS):
-        others = [sums[other] for other in sorted(sums) if other != part]
+    for fold in range(FOLDS):
+        others = [sums[other] for other in sorted(sums) if other != fold]
         seen = reduce(add, others) if others else None
         if seen is None or np.count_nonzero(seen.weight) < 2:
             return None
@@ -251,7 +251,7 @@ def _against(
 ) -> Iterator[Array]:
     if len(latents.coords) < 2:
         return  # One voxel has no axes.
-    lattice = lattice_of(field)
+    lattice = voxel_index_of(field)
     places = places_of(latents.centres, alignment.transform)
     centre = places.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((places - centre).T))

@@ -68,12 +68,12 @@ def transfer(
     A particle without a voxel within `max_distance` voxels is far. It gets class 7 and properties 0
     (background), no row (drop), or the nearest voxel's material (nearest).
     """
-    from slatprep.geometry.nearest import Lattice
+    from slatprep.geometry.nearest import VoxelIndex
 
     require_one_of("far", far, get_args(Far))
     if not max_distance > 0:
         raise ConfigError(f"max_distance is {max_distance}; expected a number above 0")
-    distance, used = Lattice(field.voxels).nearest(field.locate(points))
+    distance, used = VoxelIndex(field.voxels).nearest(field.locate(points))
     near = distance <= max_distance
     taken = near | (far == "nearest")
     material = np.where(taken, field.material[used], np.uint8(BACKGROUND))

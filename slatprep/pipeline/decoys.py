@@ -218,7 +218,8 @@ def measure_errors(
     SlatprepError
         If a decoy kills its worker again when it runs alone.
     """
-    from slatprep.judge.decoys import error_rates
+    from slatprep.judge.decoys import FOLDS, error_rates
+    from slatprep.judge.witness import fold_of
 
     if reason := _no_decoys(store):
         raise StoreError(f"{store.path}: {reason}")
@@ -240,7 +241,7 @@ def measure_errors(
         if progress:
             progress(done, len(missing))
     made = tuple(one for one in found if one.evidence)
-    folds = [fold_of(str(one)) for one in store.column("object_id")]
+    folds = [fold_of(str(one), FOLDS) for one in store.column("object_id")]
     rates = error_rates(
         evidence,
         np.array([one.evidence for one in made], dtype=np.float64),
@@ -357,13 +358,6 @@ def draw_decoys(
 
 def _hash(seed: int, text: str) -> bytes:
     return hashlib.sha256(f"decoy {seed} {text}".encode()).digest()
-
-
-def fold_of(object_id: str) -> int:
-    """Return the fold of an object, which does not depend on other objects."""
-    from slatprep.judge.decoys import FOLDS
-
-    return hashlib.sha256(f"fold {object_id}".encode()).digest()[0] % FOLDS
 
 
 def align_decoy(

@@ -132,7 +132,7 @@ def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: 
     if models is None:
         crew.tell(f"witness: {len(good):,} good assets have too few classes; latents are not used")
         return assets
-    model_of = [models[witness.part_of(object_id)] for object_id in objects]
+    model_of = [models[witness.fold_of(object_id)] for object_id in objects]
     tasks = ((*task, spool, parameters) for task in zip(assets, model_of, strict=True))
     evidence = list(run_in_order(weigh_asset, tasks, jobs))
     reliability = witness.reliability_of([evidence[k] for k in good])

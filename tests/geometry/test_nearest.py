@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from slatprep.geometry.distance import LARGEST_SIDE, signed_distance
 from slatprep.geometry.fill import outside_of
 from slatprep.geometry.frames import voxel_centres
-from slatprep.geometry.nearest import Lattice, _columns, _search_columns
+from slatprep.geometry.nearest import VoxelIndex, _columns, _search_columns
 from slatprep.geometry.surroundings import DIRECTIONS, labelled, shares_around
 from slatprep.geometry.voxels import voxels_of
 
@@ -26,7 +26,7 @@ def test_the_nearest_voxel_is_a_kd_tree_s(count, seed, spread, side):
     voxels = np.unique(corner + rng.integers(0, side, (count, 3)), axis=0).astype(np.uint8)
     points = rng.uniform(-spread, spread, (200, 3))
     points[:50] = np.round(points[:50] * 128) / 128  # on voxels, faces and edges
-    distance, index = Lattice(voxels).nearest(points)
+    distance, index = VoxelIndex(voxels).nearest(points)
     expected, _ = cKDTree(voxel_centres(voxels)).query(points)
     np.testing.assert_allclose(distance, expected * 64, atol=1e-9)
     apart = np.linalg.norm(points - voxel_centres(voxels[index]), axis=1) * 64
@@ -68,7 +68,7 @@ def test_of_equally_near_voxels_within_a_limit_the_first_is_found(held, limit):
     least = squares.min(axis=1)
     within = least <= (4 * limit) ** 2
     places = voxel_centres(quarters / 4)
-    distance, index = Lattice(voxels.astype(np.uint8)).nearest(places, limit=limit)
+    distance, index = VoxelIndex(voxels.astype(np.uint8)).nearest(places, limit=limit)
     np.testing.assert_array_equal(index, np.where(within, squares.argmin(axis=1), -1))
     np.testing.assert_allclose(distance[within], np.sqrt(least[within]) / 4, rtol=1e-12)
     assert within.any() and np.isinf(distance[~within]).all()
@@ -109,29 +109,29 @@ def test_a_point_that_is_far_off_costs_few_looks(held):
 
 def test_an_empty_set_is_refused():
     with pytest.raises(ValueError, match="empty"):
-        Lattice(np.zeros((0, 3), dtype=np.uint8))
+        VoxelIndex(np.zeros((0, 3), dtype=np.uint8))
 
 
 def _voted(voxels, labels, points, width, most=2.0):
-    return Lattice(voxels).voted(points, labels, width, most)[1].tolist()
+    return VoxelIndex(voxels).voted(points, labels, width, most)[1].tolist()
 
 
 def test_where_nobody_votes_or_nothing_is_near_the_nearest_stands():
     voxels = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=np.uint8)
     points, labels = voxel_centres([[0, 0, -3], [0, 0, -0.4]]), np.array([1, 0, 0], np.uint8)
-    distance, index, near = Lattice(voxels).voted(points, labels, 9.0, 2.0)
+    distance, index, near = VoxelIndex(voxels).voted(points, labels, 9.0, 2.0)
     assert (index.tolist(), near.tolist()) == ([0, 2], [False, True])
     np.testing.assert_allclose(distance, [3.0, 1.16**0.5])
     assert _voted(voxels, labels, points, 9.0, most=0.3) == [0, 0]
 
 
 def test_each_vote_is_of_its_own_labels():
-    """Of a lattice that has voted before, with labels that all agreed where these do not."""
+    """Of an index that has voted before, with labels that all agreed where these do not."""
     voxels = np.array([[30, 20, 20], [31, 20, 20], [31, 21, 20], [31, 19, 20]], dtype=np.uint8)
     point = voxel_centres([[30.4, 20, 20]])
-    lattice = Lattice(voxels)
+    held = VoxelIndex(voxels)
     for labels, winner in (([0] * 4, 0), ([2, 5, 5, 5], 1), ([0] * 4, 0)):
-        voted = lattice.voted(point, np.array(labels, np.uint8), 1.0, 2.0)[1]
+        voted = held.voted(point, np.array(labels, np.uint8), 1.0, 2.0)[1]
         assert voted.tolist() == [winner]
 
 
@@ -150,7 +150,7 @@ def test_votes_are_those_of_a_plain_count(seed, width):
     # On one side all are alike, so that there is a border.
     labels = np.where(voxels[:, 0] > 22, 3, rng.integers(0, 7, len(voxels))).astype(np.uint8)
     points = voxel_centres(rng.integers(19, 27, (20, 3))) + rng.uniform(-0.5, 0.5, (20, 3)) / 64
-    distances, spokesmen, _ = Lattice(voxels).voted(points, labels, width, np.inf)
+    distances, spokesmen, _ = VoxelIndex(voxels).voted(points, labels, width, np.inf)
     for point, spokesman, distance in zip(points, spokesmen, distances, strict=True):
         index = (point + 0.5) * 64 - 0.5
         around = np.abs(voxels - np.rint(index)).max(axis=1) <= 1

@@ -43,7 +43,7 @@ OF_PLACEMENT = ("margin", "clear_by", "ties", "alike")
 def _ends(name: str) -> tuple[float, float]:
     """Return a figure's value for usual right ones, and for the worst that the model knows."""
     model = PLACEMENT if name in OF_PLACEMENT else SAME_OBJECT
-    own = [figure for figure in model.figures if figure.name == name]
+    own = [term for term in model.terms if term.name == name]
     if not own:
         return 0.0, 0.0  # It counts for nothing.
     usual = next((f.usual for f in own if f.low < f.usual < f.high), own[0].usual)
@@ -297,12 +297,12 @@ def test_own_objects_pass_and_other_objects_fail(cases, judged):
 
 @pytest.mark.parametrize(
     ("asked", "name"),
-    sorted({(asked, figure.name) for asked in MODELS for figure in MODELS[asked].figures}),
+    sorted({(asked, term.name) for asked in MODELS for term in MODELS[asked].terms}),
 )
 def test_a_better_figure_never_lowers_confidence(asked, name):
     model = MODELS[asked]
     assert model.names == evidence.FIGURES
-    own = [figure for figure in model.figures if figure.name == name]
+    own = [term for term in model.terms if term.name == name]
     assert all(first.high == then.low for first, then in pairwise(own))
     values = np.repeat(USUAL[None], 40, axis=0)
     values[:, evidence.FIGURES.index(name)] = np.linspace(own[0].low - 0.1, own[-1].high + 0.1, 40)
@@ -313,7 +313,7 @@ def test_a_better_figure_never_lowers_confidence(asked, name):
 
 
 def test_each_question_has_figures_of_its_own():
-    looked_at = {name: {figure.name for figure in model.figures} for name, model in MODELS.items()}
+    looked_at = {name: {term.name for term in model.terms} for name, model in MODELS.items()}
     assert looked_at["right placement"] <= set(OF_PLACEMENT)
     assert not looked_at["same object"] & set(OF_PLACEMENT)
     assert all(looked_at.values())

@@ -16,16 +16,16 @@ from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.judge.witness import (
     BLOCK,
     DECISIVE,
+    FOLDS,
     HARMLESS,
-    PARTS,
     REACH,
     LatentEvidence,
     LatentModel,
     Reliability,
     choice_of,
     fit_models,
+    fold_of,
     moments_of,
-    part_of,
     reliability_of,
     weigh,
 )
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 def ids_of(part: int, number: int) -> list[str]:
     """Return so many ids of objects that belong to a part."""
-    return [name for name in map(str, range(99)) if part_of(name) == part][:number]
+    return [name for name in map(str, range(99)) if fold_of(name) == part][:number]
 
 
 def a_model(seed: int = 0) -> LatentModel:
@@ -65,7 +65,7 @@ def test_moments_of_an_asset_have_the_weight_of_one_asset():
 def test_a_model_has_the_moments_of_the_classes_about_their_means():
     """In two passes over weighted voxels. Some classes have less than one asset's weight in all."""
     rng = np.random.default_rng(1)
-    (part, *others) = range(PARTS)
+    (part, *others) = range(FOLDS)
     samples, moments = [], []
     for name in (ids_of(other, 1)[0] for other in others):
         known = int(rng.integers(20, 60))
@@ -399,7 +399,7 @@ class Asset:
         self.latents = StructuredLatents(latents_of(coords).coords, feats)
 
     def evidence(self, models: list[LatentModel], *tied: np.ndarray) -> LatentEvidence:
-        model = models[part_of(self.object_id)]
+        model = models[fold_of(self.object_id)]
         return weigh(
             self.field, self.latents, aligned(*tied), self.material, model, SampleParameters()
         )

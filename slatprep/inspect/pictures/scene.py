@@ -137,10 +137,10 @@ def surface_distance(
 
     Surface voxels (M, 3) and (K, 3) are each in their own frame; `way` maps between the frames.
     """
-    from slatprep.geometry.nearest import Lattice
+    from slatprep.geometry.nearest import VoxelIndex
 
     _, _, scale = split_transform(way.transform)
-    distance, _ = Lattice(pixieverse).nearest(way.to_pixieverse(voxel_centres(slat)))
+    distance, _ = VoxelIndex(pixieverse).nearest(way.to_pixieverse(voxel_centres(slat)))
     return np.asarray(distance * scale)
 
 
