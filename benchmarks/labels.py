@@ -170,7 +170,10 @@ def compare(folder: Path, alone: Path, heard: Path) -> None:
 
 
 def bound(store: Path, shares: Sequence[float]) -> None:
-    train, val = (SlatDataset(store, split, shares=Shares(*shares)) for split in ("train", "val"))
+    train, val = (
+        SlatDataset(store, split, shares=Shares(*shares), verdicts="all")
+        for split in ("train", "val")
+    )
     stuffs, counts = stuffs_of(train)
     normalization = train.store.normalization
     scores = [score(val[k], stuffs, counts, normalization) for k in range(len(val))]

@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    dataset = SlatDataset(arguments.store)
+    dataset = SlatDataset(arguments.store, verdicts="all")
     order = np.random.default_rng(0).permutation(len(dataset)).tolist()
     with tempfile.TemporaryDirectory() as name:
         folders = {kind: Path(name) / kind for kind in ("npz", "compressed npz")}

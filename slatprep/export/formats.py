@@ -12,9 +12,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError, require_one_of, tally
+from slatprep.errors import ConfigError, StoreError, tally
 from slatprep.geometry.frames import voxel_centres
-from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, Verdict, words_of
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, words_of
 from slatprep.store import Store, StoredAsset
 from slatprep.store.records import StoredRecords
 
@@ -43,28 +43,18 @@ class Exported(NamedTuple):
     figures: Mapping[str, float] = MappingProxyType({})
 
 
-def verdicts_of(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the verdicts that words name, none for ``all``; ConfigError for an unknown word."""
-    words = words_of(words)
-    for one in sorted(words):
-        require_one_of("verdict", one, (*Verdict, "all"))
-    return () if "all" in words else tuple(words)
-
-
 def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str]) -> list[str]:
     """Return the sorted ids of `assets` with one of `verdicts`; an empty sequence takes all.
 
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
-    assets, verdicts = words_of(assets), verdicts_of(verdicts)
-    rows = sorted({store.match(name) for name in assets}) or range(len(store))
-    verdict = store.column("verdict")
-    ids = (store.ids[row] for row in rows if not verdicts or verdict[row] in verdicts)
-    chosen = sorted(ids)
+    wanted = store.with_verdicts(verdicts)
+    rows = sorted({store.match(name) for name in words_of(assets)}) or range(len(store))
+    chosen = sorted(store.ids[row] for row in rows if wanted[row])
     if not chosen:
         raise ConfigError(
-            f"{store.path}: no asset has the verdict {' or '.join(verdicts)}; those asked for "
-            f"are {tally(verdict[list(rows)])}"
+            f"{store.path}: no asset has the verdict {' or '.join(words_of(verdicts))}; those "
+            f"asked for are {tally(store.column('verdict')[list(rows)])}"
         )
     return chosen
 

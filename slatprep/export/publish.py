@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError, apart_from, printable
 from slatprep.export import croissant, export_store, target
 from slatprep.export.croissant import Stated
-from slatprep.export.formats import verdicts_of
 from slatprep.records import USABLE, Place, Verdict
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import storage_of
@@ -79,7 +78,7 @@ def publish_store(
             (folder / DESCRIPTION).write_text(croissant.to_json(document), encoding="utf-8")
         else:
             where = f"{SHARDS}/*.tar"
-            chosen = USABLE if verdicts is None else verdicts_of(verdicts)
+            chosen = USABLE if verdicts is None else verdicts
             assets = export_store(
                 opened, folder / SHARDS, "webdataset", verdicts=chosen, progress=progress
             ).assets
@@ -145,10 +144,9 @@ def card_of(
 
     `data` is the path of the data relative to the card: the store's name, or a pattern of shards.
     `pictures` names the pictures beside the card. The data have only assets with one of
-    `verdicts`, or all if it is empty.
+    `verdicts`; empty or ``all`` is all of them.
     """
-    verdict = store.column("verdict").astype(str)
-    kept = np.isin(verdict, verdicts) if verdicts else np.ones(len(store), dtype=bool)
+    kept = store.with_verdicts(verdicts)
     title = stated.name or store.name.removesuffix(".zarr")
     shards = data.endswith(".tar")
     head: dict[str, Any] = {

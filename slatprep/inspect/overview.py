@@ -130,12 +130,11 @@ def rows_chosen(
     store: Store, verdicts: Collection[str] = (), categories: Collection[str] = ()
 ) -> list[int]:
     """Return the rows of assets with these verdicts and categories; empty takes all."""
-    verdicts, categories = words_of(verdicts), words_of(categories)
-    named = zip(store.column("verdict"), store.column("category"), strict=True)
+    categories, wanted = words_of(categories), store.with_verdicts(verdicts)
     return [
         row
-        for row, (verdict, category) in enumerate(named)
-        if (not verdicts or verdict in verdicts) and (not categories or category in categories)
+        for row, category in enumerate(store.column("category"))
+        if wanted[row] and (not categories or category in categories)
     ]
 
 

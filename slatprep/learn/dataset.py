@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, amount
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
-from slatprep.learn.splits import select_assets
+from slatprep.learn.splits import assign_store, select_assets
 from slatprep.readers.splits import Shares, Split
 from slatprep.records import FEATS_MEAN as FEATS_MEAN
 from slatprep.records import FEATS_STD as FEATS_STD
-from slatprep.records import UNANNOTATED, Place
+from slatprep.records import UNANNOTATED, USABLE, Place
 from slatprep.store import Store, open_store
 
 IGNORED = -100
@@ -122,8 +122,9 @@ class SlatDataset(Dataset[Item]):
     splits : mapping of str to {"train", "val", "test"}, optional
         Split of each object by id, such as from `slatprep.learn.splits.assign_store`;
         by default the split by hash.
-    verdicts : str or collection of str, optional
-        Only assets with one of these verdicts.
+    verdicts : str or collection of str
+        Only assets with one of these verdicts, by default good and doubtful ones; empty or ``all``
+        takes all.
     max_ambiguity : float, optional
         Only assets with at most this ambiguity.
     min_confidence : float, optional
@@ -148,21 +149,20 @@ class SlatDataset(Dataset[Item]):
         *,
         shares: Shares = Shares(),  # noqa: B008 (immutable)
         splits: Mapping[str, Split] | None = None,
-        verdicts: Collection[str] | None = None,
+        verdicts: Collection[str] = USABLE,
         max_ambiguity: float | None = None,
         min_confidence: float | None = None,
         augmentation: Augmentation = "none",
         seed: int = 0,
     ) -> None:
         self.store = open_store(store, copy=True)
+        self.split = split
+        if split is not None and splits is None:
+            splits = assign_store(self.store, shares=shares).splits
         self.indices = select_assets(
-            self.store,
-            split,
-            shares=shares,
-            splits=splits,
-            verdicts=verdicts,
-            max_ambiguity=max_ambiguity,
+            self.store, split, splits=splits, verdicts=verdicts, max_ambiguity=max_ambiguity
         )
+        self._left_out = len(select_assets(self.store, split, splits=splits)) - len(self)
         if len(self.indices) == 0:
             raise ConfigError(
                 f"{self.store.path} has no asset of split {split or 'all'} that passes the "
@@ -177,9 +177,15 @@ class SlatDataset(Dataset[Item]):
     def __len__(self) -> int:
         return len(self.indices)
 
+    def __repr__(self) -> str:
+        return (
+            f"<SlatDataset {self.store.path}, split {self.split or 'all'}: "
+            f"{amount(len(self), 'asset')}, {self._left_out:,} left out by verdict or ambiguity>"
+        )
+
     def __getitem__(self, key: int | Draw) -> Item:
         draw = key if isinstance(key, Draw) else Draw(key, 0)
-        if not 0 <= draw.number < len(self):
+        if not -len(self) <= draw.number < len(self):
             raise IndexError(f"asset {draw.number} of {len(self)}")
         rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
         asset_id = self.asset_ids[draw.number]
@@ -242,7 +248,7 @@ class SlatLoader(DataLoader[SparseBatch]):
     Parameters
     ----------
     dataset : SlatDataset, Store or path
-        The assets to load; all of a store.
+        The assets to load; of a store, those that a `SlatDataset` takes by default.
     batch_size : int
         Assets in a batch; the last may have fewer.
     shuffle : bool

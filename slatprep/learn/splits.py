@@ -11,7 +11,6 @@ from slatprep.errors import require_one_of
 from slatprep.readers.splits import HASH, SPLITS, Assignment, Split, assign_splits
 from slatprep.readers.splits import Shares as Shares
 from slatprep.readers.splits import split_of as split_of
-from slatprep.records import Verdict, words_of
 from slatprep.store import Store
 
 
@@ -36,24 +35,19 @@ def select_assets(
     split: Split | None = None,
     *,
     shares: Shares = Shares(),  # noqa: B008 (immutable)
-    verdicts: Collection[str] | None = None,
+    verdicts: Collection[str] = (),
     max_ambiguity: float | None = None,
     splits: Mapping[str, Split] | None = None,
 ) -> NDArray[np.int64]:
     """Return the rows (K,) of the assets in a split, in the order of the store.
 
-    Assets must have one of `verdicts`, and an ambiguity of at most `max_ambiguity`, not NaN. Assets
-    without a valid voxel have no labels, and are left out. `splits` gives the split of each object
-    by id, by default the split by hash. ConfigError if split or verdict is unknown.
+    Assets must have one of `verdicts`, if given, and an ambiguity of at most `max_ambiguity`, not
+    NaN. Assets without a valid voxel have no labels, and are left out. `splits` gives the split of
+    each object by id, by default the split by hash. ConfigError if split or verdict is unknown.
     """
     if split is not None:
         require_one_of("split", split, SPLITS)
-    chosen = store.column("valid_share") > 0
-    if verdicts is not None:
-        verdicts = words_of(verdicts)
-        for one in sorted(verdicts):
-            require_one_of("verdict", one, Verdict)
-        chosen &= np.isin(store.column("verdict").astype(str), sorted(verdicts))
+    chosen = store.with_verdicts(verdicts) & (store.column("valid_share") > 0)
     if max_ambiguity is not None:
         chosen &= store.column("ambiguity") <= max_ambiguity
     if split is not None:

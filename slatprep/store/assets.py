@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import operator
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from html import escape
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError, UnknownAssetError, amount
-from slatprep.records import Contents, Normalization, Place
+from slatprep.errors import StoreError, UnknownAssetError, amount, require_one_of
+from slatprep.records import Contents, Normalization, Place, Verdict, words_of
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import connected
 from slatprep.storage.versions import store_name
@@ -214,6 +214,17 @@ class AssetTable:
             If no id, or several ids, begin with the name; the message names some.
         """
         return match_id(name, self._index, self.path, self._listing)
+
+    def with_verdicts(self, verdicts: Collection[str]) -> NDArray[np.bool_]:
+        """Return which assets (A,) have one of the verdicts; ``all``, or none, takes every asset.
+
+        ConfigError for an unknown word.
+        """
+        words = words_of(verdicts)
+        for one in words:
+            require_one_of("verdict", one, (*Verdict, "all"))
+        every = not words or "all" in words
+        return np.isin(self.column("verdict").astype(str), list(Verdict if every else words))
 
     @property
     def _listing(self) -> str:

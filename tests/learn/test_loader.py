@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import re
 import shutil
 import subprocess
 import sys
@@ -63,6 +64,27 @@ def test_filters(learn_store):
         learn.Shares(0.5, 0.1, 0.1)
     with pytest.raises(ConfigError, match="no asset"):
         learn.SlatDataset(store, "train", shares=learn.Shares(0.0, 0.0, 1.0))
+
+
+def test_failed_assets_are_left_out_unless_all_are_asked_for(learn_store, tmp_path):
+    copy = Path(shutil.copytree(learn_store, tmp_path / "copy.zarr"))
+    verdicts = zarr.open_group(copy, mode="r+", use_consolidated=False)["asset/verdict"]
+    words = np.asarray(verdicts[:]).astype(object)
+    words[[1, 4, 7]] = "failed", "doubtful", "failed"
+    verdicts[:] = words
+    dataset = learn.SlatDataset(copy)
+    assert dataset.indices.tolist() == [0, 2, 3, 4, 5, 6, 8]
+    assert f"{copy}, split all: 7 assets, 2 left out by verdict" in repr(dataset)
+    assert dataset[-1].asset_id == dataset[6].asset_id == dataset.asset_ids[-1]
+    for number in (7, -8):
+        with pytest.raises(IndexError):
+            dataset[number]
+    for everything in ("all", (), ("all", "good")):
+        assert len(learn.SlatDataset(copy, verdicts=everything)) == 9
+    parts = [learn.SlatDataset(copy, split, shares=THIRDS) for split in SPLITS]
+    left = [int(re.search(r"(\d+) left out", repr(part))[1]) for part in parts]
+    assert sum(map(len, parts)) == 7 and sum(left) == 2
+    assert next(iter(learn.SlatLoader(copy, 9))).asset_ids == dataset.asset_ids
 
 
 def test_batch_is_what_zarr_reads(learn_store):
