@@ -4,8 +4,7 @@ Work done by other code must be done again, but a new command, a new comment
 or a new release must not cost a day of alignment. So the fingerprint covers
 only the modules that the stages read, align, sample and judge can reach, and
 the JSON files of the same names. It covers statements, without comments, layout
-and the docstrings of modules, classes and functions; the text below a constant
-counts.
+and docstrings, those of constants included.
 """
 
 from __future__ import annotations
@@ -124,10 +123,12 @@ def _parsed(text: bytes) -> ast.Module:
     tree = ast.parse(text)
     for node in _statements(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            first = node.body[0] if node.body else None
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                node.body = node.body[1:]
+            node.body = [one for one in node.body if not _is_text(one)]
     return tree
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
 
 
 def _imports(path: Path) -> Iterator[str]:

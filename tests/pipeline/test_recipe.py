@@ -71,9 +71,11 @@ def test_statements_count_and_words_do_not(tmp_path, monkeypatch):
         module.write_text(text)
         return str(code_fingerprint.__wrapped__())
 
-    first = of('"""Words."""\n\n\ndef f(x):\n    """More."""\n    return x + 1  # why\n')
-    assert of("def f(x):\n    return (x +\n            1)\n") == first
-    assert of("def f(x):\n    return x + 2\n") != first
+    words = '"""Words."""\n\nA = 2\n"""Of A."""\n\n\ndef f(x):\n    """More."""\n'
+    first = of(words + "    return x + 1  # why\n")
+    assert of("A = 2\ndef f(x):\n    return (x +\n            1)\n") == first
+    assert of("A = 2\ndef f(x):\n    return x + 2\n") != first
+    assert of("A = 3\ndef f(x):\n    return x + 1\n") != first
 
 
 def test_numbers_beside_a_module_count(tmp_path, monkeypatch):
