@@ -44,7 +44,7 @@ class SourceStore(Store):
 
     It shares the data that the given store has read, and its open files.
 
-    `damaged` are the damaged files of its records.
+    `damaged` are the damaged files of its records; `run` tells this opening from others.
     """
 
     def __init__(self, store: Store, damaged: frozenset[str] = frozenset()) -> None:
@@ -54,10 +54,10 @@ class SourceStore(Store):
         self.records = StoredRecords(store)
         # A process that lives on must not use data of an older store at the same path, whose
         # rows may have been in another order under the same build id.
-        self._run = uuid.uuid4().hex
+        self.run = uuid.uuid4().hex
 
     def __reduce__(self) -> tuple[Callable[..., SourceStore], tuple[object, ...]]:
-        return _in_this_process, (self.path, self.damaged, self._run)
+        return _in_this_process, (self.path, self.damaged, self.run)
 
     @property
     def build(self) -> dict[str, Any]:

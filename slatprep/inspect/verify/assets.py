@@ -209,7 +209,7 @@ def source_findings(
             else:
                 file, _ = storage_of(root).locate(path)
                 size = storage_of(file).size()
-                digest = _digest(file, store) if size == source.size else ""
+                digest = _digest(file, store.run) if size == source.size else ""
             what = "" if digest == source.sha256 else "its bytes changed"
             if size != source.size:
                 what = f"has {size} of {source.size} bytes"
@@ -339,7 +339,7 @@ def _equal(said: object, held: object) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _digest(path: Place, _store: SourceStore) -> str:
-    # Cached, because one file may hold the SLATs of many assets. The store is part of the cache's
+def _digest(path: Place, _run: str) -> str:
+    # Cached, because one file may hold the SLATs of many assets. The run is part of the cache's
     # key, because files may change between two verifications.
     return file_digest(path)

@@ -1,5 +1,6 @@
 """Whatever is wrong with a store is found, and named."""
 
+import gc
 import json
 import os
 import shutil
@@ -363,6 +364,14 @@ def test_a_second_look_remembers_nothing_of_the_first(store, mixed, tmp_path):
     findings = found(store, roots=roots, sources=True)
     assert {"its bytes changed"} <= {f.what for f in of_file(findings, str(slat))}
     assert any(finding.asset == "zebra" for finding in findings)
+
+
+def test_the_files_of_a_store_are_closed_after_its_sources_were_compared(store, mixed):
+    roots = SourceRoots(mixed.root / "pixieverse", mixed.root / "slat")
+    assert verify_store(store, roots=roots, sources=True).ok
+    gc.collect()
+    opened = [path.readlink() for path in Path("/proc/self/fd").iterdir() if path.is_symlink()]
+    assert not [path for path in opened if path.is_relative_to(store)]
 
 
 def test_sources_that_nobody_knows_of_are_asked_for(store):
