@@ -133,7 +133,7 @@ def train(
     from slatprep.learn.runs import LAST
     from slatprep.learn.train import TrainParameters
     from slatprep.learn.train import train as run
-    from slatprep.records import USABLE, Verdict
+    from slatprep.records import USABLE
     from slatprep.storage.atomic import writing
 
     source = click.get_current_context().get_parameter_source
@@ -157,7 +157,7 @@ def train(
         size=size,
         split_by=rule["by"],
         shares=rule["shares"],
-        verdicts=verdicts or tuple(Verdict),
+        verdicts=verdicts,
         **vars(training),
     )
     runs = {name: out / name for name in _SIZES} if all_sizes else {size: out}

@@ -215,13 +215,9 @@ UsableVerdicts = Annotated[
     tuple[str, ...] | None,
     ChoiceOf("slatprep.records:Verdict", "all"),
     "Only assets with this verdict; may be repeated. [default: good and doubtful]",
-    Click(
-        "--verdict",
-        multiple=True,
-        callback=lambda _context, _parameter, given: () if "all" in given else given or None,
-    ),
+    Click("--verdict", multiple=True, callback=lambda _context, _parameter, it: it or None),
 ]
-"""Empty for all, None if the option was not given."""
+"""None if the option was not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,7 +31,7 @@ from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import assign_store
 from slatprep.readers.files import refusing
 from slatprep.readers.splits import HASH, Assignment, Shares, Split
-from slatprep.records import USABLE, Place
+from slatprep.records import USABLE, Place, Verdict, words_of
 from slatprep.storage.documents import adapter_of
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
@@ -72,8 +72,8 @@ class TrainParameters:
         Training stops after this number of epochs without a better validation loss.
     augmentation : str
         none, upright or all, see `slatprep.learn.augment`.
-    verdicts : tuple of str
-        Only assets with one of these verdicts.
+    verdicts : str or iterable of str
+        Only assets with one of these verdicts; ``all`` takes all.
     max_ambiguity : float, optional
         Only assets with at most this ambiguity.
     split_by : str
@@ -106,6 +106,8 @@ class TrainParameters:
     def __post_init__(self) -> None:
         for name, allowed in (("size", tuple(SIZES)), ("precision", PRECISIONS), ("keep", KEEPS)):
             require_one_of(name, getattr(self, name), allowed)
+        words = words_of(self.verdicts)
+        object.__setattr__(self, "verdicts", tuple(Verdict if "all" in words else words))
 
 
 @dataclass(frozen=True)

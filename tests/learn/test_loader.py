@@ -20,6 +20,7 @@ from slatprep import ConfigError, learn, open_store
 from slatprep.learn import decoder
 from slatprep.learn.augment import lattice_symmetries
 from slatprep.learn.splits import select_assets
+from slatprep.learn.train import TrainParameters
 from slatprep.readers.splits import SPLITS, split_objects
 
 THIRDS = learn.Shares(0.4, 0.3, 0.3)
@@ -52,6 +53,7 @@ def test_filters(learn_store):
     store = open_store(learn_store)
     good = select_assets(store, verdicts=("good",))
     assert learn.SlatDataset(learn_store, verdicts="good").indices.tolist() == good.tolist()
+    assert TrainParameters(verdicts="all").verdicts == ("good", "doubtful", "failed")
     with pytest.raises(ConfigError, match="verdict is 'fine'; expected one of good"):
         learn.SlatDataset(store, verdicts="fine")
     assert good.tolist() == np.flatnonzero(store.column("verdict").astype(str) == "good").tolist()
