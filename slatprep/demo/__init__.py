@@ -1,8 +1,8 @@
-"""Demo data: procedural assets with exactly known truth, in the layouts of real ones.
+"""Make demo data: procedural assets with exactly known truth, in the layouts of real data.
 
-`shapes` and `model` define parts and materials, and `catalogue` the objects; `voxelise`,
-`difficulty`, `generated` and `nerf` make both sides of an object; `asset` adds the truth; `write`
-and `sources` write the files.
+`shapes` and `model` define parts and materials; `catalogue` defines the objects. `voxelise`,
+`difficulty`, `generated` and `nerf` make both sides of an object, and `asset` adds the truth.
+`write` and `sources` write the files.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
 
 @dataclass(frozen=True)
 class DemoSummary:
-    """The result: the folder, and the number of rows of each category and level."""
+    """The folder of a demo, its number of assets and rows, and assets by category and level."""
 
     directory: Path
     config: Path
@@ -64,7 +64,7 @@ class _Recipe:
 
     @property
     def adapter(self) -> str:
-        """The adapter of the source, and the name of its folder."""
+        """The source's adapter, which is also the name of its folder."""
         kind = self.source.partition("-")[0]
         return "pixieverse" if kind == "pixie" else kind
 
@@ -89,46 +89,47 @@ def make_demo(
 ) -> DemoSummary:
     """Make a demo dataset.
 
-    The same arguments give the same bytes, whatever `jobs`; asset number i
-    does not depend on the number of assets. Fourteen assets have every category once.
+    The same arguments give the same bytes for any `jobs`. Asset number i does not depend on
+    the number of assets. Fourteen assets have every category once.
 
     Parameters
     ----------
     directory : str or Path
-        Where to write ``pixieverse/`` (or the folder of another source), ``slat/``,
+        Folder that receives ``pixieverse/`` (or the folder of another source), ``slat/``,
         ``truth/``, ``obj_ids_metadata.json``, ``dataset.toml`` (the dataset's definition
-        for `slatprep build-store --config`) and ``demo.json`` (what was made).
+        for `slatprep build-store --config`) and ``demo.json`` (arguments and list of assets).
         It is created if missing; it must be empty or hold the same demo.
     assets, seed : int
-        Number of objects, and the seed of everything random.
+        Number of objects, and the seed of all random choices.
     levels : tuple of int, optional
         Levels of difficulty, which assets take in turn; see `slatprep.demo.difficulty`. By
         default 0 to 4, or only 0 if `source` shares the frame of the SLAT.
     views : int
-        SLATs of each object; with several, rows are named ``<object id>.<view>``.
+        Number of SLATs of each object; with several, rows are named ``<object id>.<view>``.
     latents : {"placeholder", "material"}
         Noise, or latents that depend on the material; see `slatprep.demo.latents`.
     habitual_share : float
-        Share of assets with the dataset's common quarter turn between the sides,
-        in 0..1; the others have any of the 24.
+        Share of assets, in 0..1, with the dataset's common quarter turn between the sides;
+        each of the others has any of the 24 quarter turns.
     source : str
         The source of the annotated side, a `slatprep.demo.sources.Source`: PixieVerse's
         grids, predictions with 11 or 4 channels, VoMP's or PhysXNet's voxels, or plain voxels
         with ten properties (in HDF5 without classes).
     encoder : {"trellis", "sam3d", "trellis2", "trellis2-512", "plain", "plain-128"}
         The encoder of the latents; ``trellis2-512`` has a grid of 32^3. ``plain`` has 16 channels,
-        described in ``encoder.json``, and ``plain-128`` the same on a grid of 128^3.
+        described in ``encoder.json``; ``plain-128`` has the same on a grid of 128^3.
     slat_form : {"npz", "npz-batch", "hdf5", "hdf5-groups"}
-        Coordinates (N, 3) uint8 or (N, 4) int32 in an npz, or HDF5, with a file or
-        a group per asset.
+        Form of the SLATs: an npz with coordinates (N, 3) uint8 or (N, 4) int32, or HDF5 with
+        a file or a group per asset.
     slat_names : {"id", "sha256"}
         Name the SLATs by object id, or by sha256 with TRELLIS's ``metadata.csv``.
     results : bool
         Also write ``results/``: predictions of a method with errors, 12 MB for each asset.
     samples : int
-        Annotations of each object; several have the errors of `slatprep.demo.write`.
+        Number of annotations of each object; several have the errors that
+        `slatprep.demo.write.sample_grids` adds.
     jobs : int
-        Processes.
+        Number of worker processes.
     progress : callable, optional
         Called with the number of assets done and the number of all assets.
 
@@ -140,7 +141,7 @@ def make_demo(
     Raises
     ------
     ConfigError
-        If an argument is not allowed or the folder holds something else.
+        If an argument is not allowed, or the folder holds anything but the same demo.
     """
     usual = (0,) if source in ONE_FRAME else SAME_SHAPE_LEVELS
     recipe = _Recipe(
@@ -151,7 +152,7 @@ def make_demo(
     root = Path(directory)
     _claim(root, recipe)
     tasks = ((root, recipe, index) for index in range(assets))
-    # One file for all assets has one writer.
+    # A single file for all assets allows only one writer.
     writers = 1 if slat_form == "hdf5-groups" else jobs
     made = {}
     for index, entry in run_unordered(_make_one, tasks, writers):
@@ -214,7 +215,7 @@ def _claim(root: Path, recipe: _Recipe) -> None:
     else:
         root.mkdir(parents=True, exist_ok=True)
         write_json(mark, {"recipe": plain, "assets": []})
-    (root / "slat" / "latents.h5").unlink(missing_ok=True)  # this one is added to
+    (root / "slat" / "latents.h5").unlink(missing_ok=True)  # assets are appended to this file
 
 
 def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, Any]]:
@@ -248,7 +249,7 @@ def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, A
 
 
 def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]) -> None:
-    """Write the dataset's definition, and what it names beside the sources."""
+    """Write the dataset's definition, and the files beside the sources that it names."""
     slat_root = "slat/latents.h5" if recipe.slat_form == "hdf5-groups" else "slat"
     fields, slat = {"root": recipe.adapter}, {"root": slat_root}
     pairing = {"categories": "obj_ids_metadata.json"}

@@ -1,4 +1,4 @@
-"""A demo asset: both sides of an object, and the truth."""
+"""Make a demo asset: both sides of an object, and the truth."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from slatprep.geometry.voxels import boundary
 from slatprep.records import BACKGROUND, RESOLUTION
 
 # Each random choice has a stream of its own, so that one option of the demo
-# does not change what another one draws.
+# does not change the draws of another.
 _SHAPE, _FRAME, _DAMAGE, _LATENTS, _HABIT, _GENERATED = range(6)
 
 # A quarter turn about z, from one view to the next.
 _QUARTER = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
-# Distances to bent shapes are known less tightly and are needed over a longer range.
+# Distance bounds of bent shapes are less tight, so they are needed over a longer range.
 _GENERATED_REACH = 0.12
 
 
@@ -54,10 +54,10 @@ class DemoView:
     material : ndarray of uint8, shape (N,)
         True class of each SLAT voxel.
     properties : ndarray of float32, shape (N, 3)
-        True Young's modulus, density and Poisson's ratio of each, SI.
+        True Young's modulus, density and Poisson's ratio of each SLAT voxel, in SI units.
     places : ndarray of float64, shape (N, 3), or None
-        True place of each SLAT voxel's centre in the PixieVerse frame; None on levels where
-        `transform` is the whole map.
+        True place of each SLAT voxel's centre in the PixieVerse frame; None on levels without
+        a generated shape or a NeRF's field.
     """
 
     view: str
@@ -71,7 +71,7 @@ class DemoView:
 
 @dataclass(frozen=True)
 class DemoAsset:
-    """An object of the demo; ``grid`` is (64, 64, 64, 4) float32 as PixieVerse stores it."""
+    """An object of the demo; ``grid`` (64, 64, 64, 4) float32 has PixieVerse's format."""
 
     object_id: str
     name: str
@@ -84,7 +84,7 @@ class DemoAsset:
 
 
 def object_id(seed: int, index: int) -> str:
-    """Return the id of an object: 32 hex digits, as Objaverse's are."""
+    """Return the id of an object: 32 hex digits, like Objaverse's ids."""
     return hashlib.sha256(f"slatprep demo {seed} {index}".encode()).hexdigest()[:32]
 
 
@@ -100,39 +100,39 @@ def make_asset(
     resolution: int = RESOLUTION,
     one_frame: bool = False,
 ) -> DemoAsset:
-    """Make asset number `index` of a demo dataset, which depends on these arguments alone.
+    """Make asset number `index` of a demo dataset; it depends on these arguments alone.
 
     Parameters
     ----------
     seed, index : int
         Seed of the dataset and number of the asset in it.
     levels : tuple of int
-        The levels that the dataset goes through in turn.
+        Levels of difficulty, which assets take in turn.
     views : int
-        SLATs of the object; from the second on, the SLAT side is turned about z. Each
-        generated shape differs.
+        Number of SLATs of the object. Each is a quarter turn about z from the previous one, and
+        each generated shape differs.
     latents : {"placeholder", "material"}
         Noise, or latents that depend on the material; see `slatprep.demo.latents`.
     habitual_share : float
         Share of assets whose PixieVerse side has the dataset's common quarter
-        turn; the others have any of the 24.
+        turn; each of the others has any of the 24 quarter turns.
     channels : int
-        Channels of the latents.
+        Number of channels of the latents.
     resolution : int
-        Voxels of the SLAT along each axis: 64 times or divided by a power of two.
+        Number of voxels of the SLAT along each axis: 64 times or divided by a power of two.
     one_frame : bool
         Whether both sides come from the same mesh, so that the transform is the identity.
-        Only for level 0 and one view.
+        Allowed only for level 0 and one view.
 
     Returns
     -------
     DemoAsset
-        The object as both pipelines would give it, with the truth.
+        Both sides of the object, as the real pipelines would give them, with the truth.
     """
     categories = tuple(CATALOGUE)
     turn, place = divmod(index, len(categories))
     category = categories[place]
-    # The added turn keeps a category from meeting one level only.
+    # Adding `turn` gives each category all levels over time.
     level = levels[(index + turn) % len(levels)]
     model = CATALOGUE[category](np.random.default_rng([seed, index, _SHAPE]), turn)
     difficulty = LEVELS[level]
@@ -176,7 +176,7 @@ def make_asset(
 
 
 def _pixieverse_side(solid: Solid, frames: Frames) -> NDArray[np.int16]:
-    """Return the index of the stuff of each voxel (64, 64, 64), `EMPTY` where there is none."""
+    """Return the index of each voxel's stuff (64, 64, 64); `EMPTY` if the voxel has none."""
     filled = np.argwhere(voxelise(frames.pixieverse_distance(solid))[1])
     stuff = np.full((RESOLUTION,) * 3, EMPTY, dtype=np.int16)
     centres = frames.pixieverse.to_object(voxel_centres(filled))
@@ -206,7 +206,7 @@ def _slat_side(
     resolution: int,
 ) -> DemoView:
     surface = voxelise(frames.slat_distance(solid), max(resolution, RESOLUTION))[0]
-    # The surface meets a coarse voxel if it meets a fine one in it.
+    # The surface meets a coarse voxel if it meets a fine voxel inside.
     fine = len(surface) // resolution
     blocks = surface.reshape((resolution, fine) * 3)
     coords = np.argwhere(np.any(blocks, axis=(1, 3, 5))).astype(np.uint8)
@@ -215,6 +215,6 @@ def _slat_side(
     stuff = solid.stuff_at(frames.slat_to_object(centres))
     feats = make_latents(rng, latents, centres, material[stuff], properties[stuff], channels)
     places = frames.places(centres)
-    # Without a distortion the transform of the poses is exact.
+    # Without a distortion, the truth is the transform of the poses.
     transform = nearest_similarity(places, centres) if frames.distortion else frames.transform()
     return DemoView(view, coords, feats, transform, material[stuff], properties[stuff], places)

@@ -1,7 +1,6 @@
-"""The demo's objects: plants and fruit; toys, balls, cans, crates, sand, snow, jello, rocks, water.
+"""Build the demo's objects, with one function for each PixieVerse category.
 
-Each function builds an object of one PixieVerse category. Its `variant` counts the objects of the
-category, so that a dataset has each kind in turn.
+Its `variant` counts the objects of the category, so that a dataset has each kind in turn.
 """
 
 from __future__ import annotations
@@ -169,7 +168,7 @@ def duck(rng: Rng, variant: int) -> DemoObject:
     body, beak, eye = draw(rng, "rubber"), draw(rng, "plastic"), draw(rng, "stone")
     long, wide, tall = rng.uniform(0.52, 0.6), rng.uniform(0.38, 0.44), rng.uniform(0.33, 0.38)
     head, at = rng.uniform(0.25, 0.3), vec(0.3 * long / 0.55, 0.0, tall + 0.24)
-    look = orient(rng.normal(0.0, 0.2))  # the head turned a little to one side
+    look = orient(rng.normal(0.0, 0.2))  # turns the head a little to one side
     parts = made_of(
         body,
         ellipsoid((0, 0, 0), (long, wide, tall)),
@@ -189,7 +188,7 @@ def duck(rng: Rng, variant: int) -> DemoObject:
 
 
 def ball(rng: Rng, variant: int) -> DemoObject:
-    """Return, in turn, a ball with a painted half, a plain one, an oval one with laces."""
+    """Return, in turn, a ball with a painted half, a plain ball or an oval ball with laces."""
     skin, paint = draw(rng, "rubber"), draw(rng, "plastic")
     if variant % 3 == 2:
         round_, long = rng.uniform(0.33, 0.38), rng.uniform(0.55, 0.62)
@@ -198,7 +197,7 @@ def ball(rng: Rng, variant: int) -> DemoObject:
         along = capsule((-0.22, 0, round_), (0.22, 0, round_), 0.045)
         across = [capsule((x, -0.09, top), (x, 0.09, top), 0.04) for x in (-0.16, 0, 0.16)]
         parts += made_of(lace, along, *across)
-        # Half a turn about z leaves it unchanged.
+        # Half a turn about z leaves the ball unchanged.
         return DemoObject("oval ball", parts, symmetric=True)
     coats = ((half_space((0, 0, 0), direction(rng)), paint),) if variant % 3 == 0 else ()
     name = "half-painted ball" if coats else "plain ball"
@@ -206,7 +205,7 @@ def ball(rng: Rng, variant: int) -> DemoObject:
 
 
 def soda_can(rng: Rng, variant: int) -> DemoObject:
-    """Return a can, every second one dented and with an open tab."""
+    """Return a can; every second can is dented and has an open tab."""
     metal, drink = draw(rng, "aluminium"), draw(rng, "water")
     r, h = rng.uniform(0.25, 0.3), rng.uniform(0.9, 1.05)
     walls = [
@@ -220,7 +219,7 @@ def soda_can(rng: Rng, variant: int) -> DemoObject:
         middle = around(rng.uniform(0, 2.0 * np.pi), r + 0.16, rng.uniform(0.35, 0.6) * h)
         content = carve(content, sphere(middle, 0.27 + 0.06))
         walls = [carve(wall, sphere(middle, 0.27)) for wall in walls]
-    # The content is deep inside; only metal is on the surface.
+    # The drink is deep inside; only metal is on the surface.
     parts = [Part(wall, metal, ((content.distance, drink),)) for wall in walls]
     parts += made_of(metal, torus((0, 0, h), (0, 0, 1), 0.78 * r, 0.03))
     if dented:
@@ -231,7 +230,7 @@ def soda_can(rng: Rng, variant: int) -> DemoObject:
 
 
 def crate(rng: Rng, variant: int) -> DemoObject:
-    """Return a crate with ribs, every second one with a latch and a raised lid."""
+    """Return a crate with ribs; every second crate has a latch and a raised lid."""
     frame, panel = draw(rng, "steel"), draw(rng, "aluminium")
     half = vec(0.5, rng.uniform(0.34, 0.42), rng.uniform(0.24, 0.31))
     parts = made_of(panel, box((0, 0, 0), half - 0.04))
@@ -312,7 +311,7 @@ def snowman(rng: Rng, variant: int) -> DemoObject:
 
 
 def jello(rng: Rng, variant: int) -> DemoObject:
-    """Return a jello block on a plate, in turn with cherry and spoon or without."""
+    """Return a jello block on a plate; every second one has a cherry and a spoon."""
     flesh, plate = draw(rng, "jello"), draw(rng, "ceramic")
     side, height = rng.uniform(0.27, 0.33), rng.uniform(0.16, 0.22)
     parts = made_of(plate, vessel(0.0, 0.12, 0.4, 0.62, 0.06, floor=0.06))
@@ -343,7 +342,7 @@ def rocks(rng: Rng, variant: int) -> DemoObject:
 
 
 def water(rng: Rng, variant: int) -> DemoObject:
-    """Return a glass of water, in turn with straw and lemon or without."""
+    """Return a glass of water; every second one has a straw and a lemon."""
     glass, wet = draw(rng, "glass"), draw(rng, "water")
     foot, rim, h = rng.uniform(0.22, 0.27), rng.uniform(0.3, 0.36), rng.uniform(0.8, 0.95)
     wall = 0.045
@@ -378,4 +377,4 @@ CATALOGUE: dict[str, Callable[[Rng, int], DemoObject]] = {
     "rocks": rocks,
     "water-like_bodies": water,
 }
-"""The builder of the demo's objects for each of PixieVerse's categories."""
+"""Function that builds the demo's objects, for each of PixieVerse's categories."""

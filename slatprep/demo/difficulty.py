@@ -1,7 +1,7 @@
-"""How the two sides of a demo asset differ: frames, scale, warp and damage, by level.
+"""Differences between the two sides of a demo asset, by level: frames, scale, warp, damage.
 
 ======  ==========================================================================
-level   the PixieVerse side against the SLAT side
+level   PixieVerse side compared with the SLAT side
 ======  ==========================================================================
 0       a quarter turn
 1       plus a tilt up to 15 degrees and a shift up to 1.5 voxels, one scale
@@ -14,7 +14,7 @@ level   the PixieVerse side against the SLAT side
 7       both in any rotation
 ======  ==========================================================================
 
-From level 5 on each side is scaled by its own bounding box.
+From level 5 on, each side is scaled by its own bounding box.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ _FULL = 1.0 - 1e-4
 
 @dataclass(frozen=True)
 class Difficulty:
-    """The settings of a level: angles in degrees, lengths in voxels, scale as a share.
+    """Settings of a level: angles in degrees, lengths in voxels, scale as a share.
 
-    ``bend`` is for a generated shape, see `slatprep.demo.generated.draw_distortion`; ``room`` is
-    the margin for a NeRF's field on each side of the grid.
+    ``bend`` is that of a generated shape, see `slatprep.demo.generated.draw_distortion`. ``room``
+    is the margin for a NeRF's field on each side of the grid.
     """
 
     tilt: float = 0.0
@@ -54,7 +54,7 @@ class Difficulty:
 
     @property
     def generated(self) -> bool:
-        """Whether the SLAT side is a shape of its own."""
+        """Whether the SLAT side is a generated shape."""
         return self.bend > 0.0
 
     @property
@@ -75,7 +75,7 @@ LEVELS: dict[int, Difficulty] = {
 }
 
 SAME_SHAPE_LEVELS = (0, 1, 2, 3, 4)
-"""Levels whose sides show the same clean shape, the default of a demo."""
+"""Levels on which both sides come from the same shape; the default of a demo."""
 
 QUARTER_TURNS = tuple(turn.astype(float) for turn in cube_symmetries() if np.linalg.det(turn) > 0)
 """The 24 rotations of a cube."""
@@ -83,7 +83,7 @@ QUARTER_TURNS = tuple(turn.astype(float) for turn in cube_symmetries() if np.lin
 
 @dataclass(frozen=True)
 class Pose:
-    """Where an object lies in a frame: ``x = scale * rotation @ (p - centre) + shift``."""
+    """Placement of an object in a frame: ``x = scale * rotation @ (p - centre) + shift``."""
 
     rotation: Array
     scale: float
@@ -91,11 +91,11 @@ class Pose:
     shift: Array
 
     def to_object(self, points: Array) -> Array:
-        """Map points (P, 3) of the frame to the object."""
+        """Map points (P, 3) of the frame to object coordinates."""
         return np.asarray((points - self.shift) / self.scale @ self.rotation + self.centre)
 
     def from_object(self, points: Array) -> Array:
-        """Map points (P, 3) of the object to the frame."""
+        """Map points (P, 3) in object coordinates to the frame."""
         return np.asarray(self.scale * (points - self.centre) @ self.rotation.T + self.shift)
 
 
@@ -109,7 +109,7 @@ class Frames:
     distortion: Distortion | None = None
 
     def transform(self) -> Array:
-        """Return the transform from the PixieVerse to the SLAT frame, by the poses only."""
+        """Return the transform from the PixieVerse to the SLAT frame, from the poses alone."""
         slat, pixieverse = self.slat, self.pixieverse
         rotation = slat.rotation @ pixieverse.rotation.T
         scale = slat.scale / pixieverse.scale
@@ -117,7 +117,7 @@ class Frames:
         return make_transform(rotation, offset - scale * rotation @ pixieverse.shift, scale)
 
     def slat_to_object(self, points: Array) -> Array:
-        """Map points (P, 3) of the SLAT frame to the object."""
+        """Map points (P, 3) of the SLAT frame to object coordinates."""
         mapped = self.slat.to_object(self.warp(points) if self.warp else points)
         return self.distortion(mapped) if self.distortion else mapped
 
@@ -139,7 +139,7 @@ class Frames:
 
 
 def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) -> Frames:
-    """Draw the poses of an asset, which keep both sides within their cubes.
+    """Draw the poses of an asset such that both sides lie within their cubes.
 
     `quarter` (3, 3) is the quarter turn of the PixieVerse side; the SLAT side stands upright.
     """
@@ -160,7 +160,7 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
         if difficulty.shift:
             shift = direction(rng) * rng.uniform(0.0, difficulty.shift) * VOXEL_SIZE
         box = bounding_box(solid.shapes, rotation) - rotation @ middle
-        # The largest scale at which neither side of the shifted box leaves the cube.
+        # This is the largest scale at which the shifted box lies within the cube.
         scale = float(np.min(np.stack([full / 2 + shift, full / 2 - shift]) / np.abs(box)))
         if not difficulty.own_boxes:
             mismatch = 1.0
@@ -175,14 +175,14 @@ def draw_frames(rng: Rng, solid: Solid, difficulty: Difficulty, quarter: Array) 
 def generate(rng: Rng, frames: Frames, bend: float, solid: Solid, skin: Array) -> Frames:
     """Replace the SLAT side of an asset by a generated shape that fills the cube.
 
-    `bend` is as `draw_distortion` takes it. `frames` has no warp; the rotation of its SLAT side
-    stays, and its pose is fitted to the shape. `skin` (K, 3) are points on the object's surface, at
-    most a voxel apart.
+    `draw_distortion` defines `bend`. `frames` has no warp; its SLAT side keeps its rotation, and
+    the rest of the pose is fitted to the shape. `skin` (K, 3) are points on the object's surface,
+    at most a voxel apart.
     """
     distortion = draw_distortion(rng, solid.extent, bend)
     turned = distortion.inverse(skin) @ frames.slat.rotation.T
     low, high = turned.min(axis=0), turned.max(axis=0)
-    # Between these points the surface may extend a voxel farther.
+    # The surface may extend a voxel farther between these points.
     size = (_FULL - 2.0 * VOXEL_SIZE) / float((high - low).max())
     middle = frames.slat.rotation.T @ ((low + high) / 2.0)
     pose = Pose(frames.slat.rotation, size, middle, np.zeros(3))

@@ -1,8 +1,8 @@
-"""The shape that a generator makes from one image of an object.
+"""Model the shape that a generator makes from one image of an object.
 
 Its proportions are wrong and it is bent, most on the side that the image does not show. A
-`Distortion` maps points of the generated shape to the same points of the object. The true place of
-a SLAT voxel is therefore computed, not fitted.
+`Distortion` maps points of the generated shape to the corresponding points of the object, so the
+true place of a SLAT voxel is computed, not fitted.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from slatprep.demo.model import Rng, direction
 from slatprep.geometry.frames import VOXEL_SIZE, Array
 
 _LARGEST_SLOPE = 0.7
-"""Bound on the change of a bend per distance; below 1 the map does not fold."""
+"""Upper bound on a bend's change per unit of distance; below 1 the map does not fold."""
 
 _REACH = 0.75
-"""Half edge of the cube in which bends are bounded, in sizes of the object; all shapes fit."""
+"""Half edge of the cube in which bends are bounded, in object sizes; all shapes fit inside."""
 
 _WRONG = 0.10, 0.25
-"""Least and greatest error of the proportions, along one axis, as a share."""
+"""Smallest and largest relative error of the proportions, along one axis."""
 
 _EDGE = 4.0
-"""Rate at which a bend grows from the seen to the unseen side, per size of the object."""
+"""Rate at which a bend grows from the seen to the unseen side, per object size."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Waves:
     def draw(cls, rng: Rng, voxels: float, turns: tuple[float, float], waves: int = 3) -> Self:
         """Draw a displacement of about `voxels` root mean square.
 
-        `turns` bounds how many periods a wave has across the cube.
+        `turns` are the smallest and largest number of periods of a wave across the cube.
         """
         size = voxels * VOXEL_SIZE * np.sqrt(2.0 / waves)
         amplitude = np.stack([size * direction(rng) for _ in range(waves)])
@@ -61,17 +61,17 @@ class Waves:
 
     @property
     def sizes(self) -> tuple[Array, Array]:
-        """Length of each amplitude and of each wave vector, (W,)."""
+        """Lengths (W,) of the amplitudes, and (W,) of the wave vectors."""
         return np.linalg.norm(self.amplitude, axis=1), np.linalg.norm(self.wave, axis=1)
 
     @property
     def reach(self) -> float:
-        """Bound on the displacement of any point."""
+        """Upper bound on the displacement of any point."""
         return float(self.sizes[0].sum())
 
     @property
     def stretch(self) -> float:
-        """Bound on the factor by which distances grow."""
+        """Upper bound on the factor by which distances grow."""
         amplitude, wave = self.sizes
         return 1.0 + float((amplitude * wave).sum())
 
@@ -80,24 +80,24 @@ class Waves:
 class Distortion:
     """A smooth map from the generated shape to the object, both in object coordinates.
 
-    With ``q = (y - middle) / size``, it takes a point ``y`` of the generated shape to
+    With ``q = (y - middle) / size``, it maps a point ``y`` of the generated shape to
     ``middle + size * (q + w(q) b(q)) / proportions``. Here ``b`` is a sum of plane sine waves, and
-    ``w`` grows from 2/3 on the side that the image sees to 4/3 on the other.
+    ``w`` grows from 2/3 on the side that the image shows to 4/3 on the other.
 
     Attributes
     ----------
     middle : ndarray of float64, shape (3,)
         Centre of the object's bounding box.
     size : float
-        Largest edge of that box.
+        Largest edge of this box.
     proportions : ndarray of float64, shape (3,)
         Stretch of the generated shape along each axis of the object.
     waves : Waves
-        The sine waves, in sizes of the object.
+        The sine waves, in object sizes.
     away : ndarray of float64, shape (3,)
         Unit vector that points away from the image's camera.
     slope : float
-        Bound on the change of the bend per distance.
+        Upper bound on the bend's change per unit of distance.
     """
 
     middle: Array
@@ -126,23 +126,24 @@ class Distortion:
 
     @property
     def stretch(self) -> float:
-        """Bound on the factor by which distances grow from the generated shape to the object."""
+        """Upper bound on the growth of distances from the generated shape to the object."""
         return (1.0 + self.slope) / float(self.proportions.min())
 
     def bend(self, q: Array) -> Array:
-        """Return the bend (P, 3) at points in sizes of the object."""
+        """Return the bend (P, 3) at points `q` (P, 3), both in object sizes."""
         return _growth(q, self.away)[:, None] * self.waves.displacement(q)
 
 
 def _growth(q: Array, away: Array) -> Array:
-    """Return the factor (P,) of the bend, which grows towards the unseen side."""
+    """Return the factor (P,) of the waves, which grows towards the unseen side."""
     return np.asarray(1.0 + np.tanh(_EDGE * (q @ away)) / 3.0)
 
 
 def _slope(waves: Waves, away: Array) -> float:
-    """Bound the spectral norm of a bend's derivative in the cube of half edge `_REACH`.
+    """Return an upper bound on the spectral norm of a bend's derivative.
 
-    The norm is computed on a lattice; the second derivative bounds its change between the points.
+    The norm is computed on a lattice in the cube of half edge `_REACH`; the second derivative
+    bounds its change between the lattice points.
     """
     steps = 36
     axis = np.linspace(-_REACH, _REACH, steps)
@@ -153,7 +154,7 @@ def _slope(waves: Waves, away: Array) -> float:
     rise = (_EDGE / 3.0) * (1.0 - (3.0 * (growth - 1.0)) ** 2)
     slopes = ripple.reshape(-1, 3, 3) + rise[:, None, None] * moved[:, :, None] * away
     size, turn = waves.sizes
-    # The growth is at most 4/3, its derivative _EDGE / 3, its second one 0.77 _EDGE^2 / 3.
+    # The growth is at most 4/3, its first and second derivative _EDGE / 3 and 0.77 _EDGE^2 / 3.
     second = 4.0 / 3.0 * size @ turn**2 + 2.0 * _EDGE / 3.0 * size @ turn
     second += 0.26 * _EDGE**2 * size.sum()
     half_diagonal = np.sqrt(3.0) * _REACH / (steps - 1)
@@ -163,13 +164,13 @@ def _slope(waves: Waves, away: Array) -> float:
 def draw_distortion(rng: Rng, extent: Array, bend: float) -> Distortion:
     """Draw the distortion of a generated shape, without folds.
 
-    `extent` (2, 3) is the object's bounding box. `bend` is the root mean square of the smooth part,
-    in voxels of a grid that the object fills.
+    `extent` (2, 3) is the object's bounding box. `bend` is the root mean square of the waves, in
+    voxels of a grid that the object fills; they are reduced if the map would fold.
     """
     stretch = np.ones(3)
     stretch[rng.integers(3)] += rng.choice([-1.0, 1.0]) * rng.uniform(*_WRONG)
     waves = Waves.draw(rng, bend, (0.6, 1.1))
-    # The image is taken from somewhere around the object, a little above it or below.
+    # The camera is anywhere around the object, slightly above or below it.
     angle, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.3, 0.5)
     away = np.array([-np.cos(angle), -np.sin(angle), -height])
     away /= np.linalg.norm(away)

@@ -1,7 +1,7 @@
-"""Synthetic latents of a SLAT, with the number of channels of an encoder.
+"""Make synthetic latents of a SLAT, with an encoder's number of channels.
 
-Mean and standard deviation of each channel are TRELLIS's, see `slatprep.records`; for
-encoders with more channels they repeat every eight.
+Latents with 32 channels have the mean and standard deviation of TRELLIS.2's shape latents;
+others have TRELLIS's, repeated every eight channels. See `slatprep.records.encoders`.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ GRIDS: dict[Encoder, tuple[int, int]] = {
     "plain": (16, 64),
     "plain-128": (16, 128),
 }
-"""Channels of each encoder's latents, and voxels along each axis; ``plain`` and ``plain-128``
-stand for any other encoder."""
+"""Number of channels of each encoder's latents, and of voxels along each axis.
+
+``plain`` and ``plain-128`` stand for any other encoder.
+"""
 
 MEAN, STD = np.array(FEATS_MEAN), np.array(FEATS_STD)
 
 NOISE = 0.5
-"""Share of noise (as a standard deviation) in latents that follow the material."""
+"""Standard deviation of the noise in latents that depend on the material."""
 
 _CODES: NDArray[np.float64] = np.linalg.qr(np.random.default_rng(20250101).normal(size=(8, 8)))[0]
 _PROPERTY_CENTRE = np.array([7.0, 2.8, 0.33])
@@ -49,9 +51,9 @@ def make_latents(
 ) -> NDArray[np.float32]:
     """Return latents (N, channels) float32 for SLAT voxels with centres (N, 3) in the unit cube.
 
-    ``placeholder`` latents are normal noise. ``material`` latents are `NOISE` times that, with
-    `clean_latents` added to the first eight channels. Both are then scaled to the encoder's mean
-    and standard deviation. `properties` (N, 3) are Young's modulus, density, Poisson's ratio, SI.
+    ``placeholder`` latents are normal noise. ``material`` latents are `NOISE` times this noise,
+    plus `clean_latents` in the first eight channels. Both are then scaled to the encoder's mean and
+    standard deviation. `properties` (N, 3) are Young's modulus, density, Poisson's ratio, SI.
     """
     z = rng.normal(size=(len(centres), channels))
     if kind == "material":
@@ -71,8 +73,8 @@ def clean_latents(
     They are ``2 * code[material] + p @ code[:3] + sin(pi * x) @ code[3:6] / 2``. Here ``code`` are
     eight fixed orthonormal vectors, ``p`` the three properties (log10 Young's modulus, log10
     density, Poisson's ratio) mapped to about -1..1, and ``x`` the voxel's centre. They are linear
-    in the targets, so a linear model of single voxels has the right form. It cannot use
-    neighbouring voxels, whose noise is independent.
+    in the targets, so a linear model of single voxels has the right form. Neighbouring voxels do
+    not help, because the noise of each voxel is independent.
     """
     mapped = properties.astype(np.float64)
     mapped[:, :2] = np.log10(mapped[:, :2])

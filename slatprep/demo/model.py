@@ -1,7 +1,7 @@
-"""An object of the demo, its materials, and the pieces that several objects share.
+"""Define a demo object, its materials, and the pieces that several objects share.
 
-z is up and units are arbitrary; proportions and positions come from the
-generator. Materials lie within the span that Pixie publishes for PixieVerse
+z is up and units are arbitrary; proportions and positions come from the random
+generator. Materials lie within the ranges that Pixie publishes for PixieVerse
 (density 50 to 7,400 kg/m^3, Young's modulus 1e3 to 7.6e10 Pa, Poisson's ratio
 0.21 to 0.449); classes are PhysGaussian's.
 """
@@ -48,9 +48,9 @@ MATERIALS: dict[str, tuple[int, Range, Range, Range]] = {
 
 
 def draw(rng: Rng, name: str) -> Stuff:
-    """Draw a stuff of a named material: Young's modulus log-uniform, the rest uniform.
+    """Draw a stuff of a named material: Young's modulus log-uniform, other values uniform.
 
-    Values are rounded to three digits, as the labels of PixieVerse are.
+    Values are rounded to three digits, like the labels of PixieVerse.
     """
     material, modulus, density, poisson = MATERIALS[name]
     return Stuff(
@@ -65,7 +65,7 @@ def draw(rng: Rng, name: str) -> Stuff:
 class DemoObject:
     """An object of the demo.
 
-    ``symmetric`` is true if several placements have the same geometry, whatever the materials.
+    ``symmetric`` is true if several placements have the same geometry, ignoring materials.
     """
 
     name: str
@@ -74,7 +74,7 @@ class DemoObject:
 
 
 def made_of(stuff: Stuff, *shapes: Shape) -> list[Part]:
-    """Return parts of one stuff."""
+    """Return a part of the same stuff for each shape."""
     return [Part(shape, stuff) for shape in shapes]
 
 
@@ -89,7 +89,7 @@ def around(angle: float, radius: float, z: float) -> Array:
 
 
 def orient(angle: float, tilt: float = 0.0) -> Array:
-    """Return a rotation (3, 3) about z by `angle` after tilting about y by `tilt` (radians)."""
+    """Return the rotation (3, 3) by `tilt` about y, then by `angle` about z, in radians."""
     c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(tilt), np.sin(tilt)
     heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     return np.asarray(heading @ np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]]))
@@ -110,7 +110,7 @@ def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
     """Return a convex stone with irregular faces."""
     faces = 13
     normals = even_directions(faces) + rng.normal(0.0, 0.18, (faces, 3))
-    # A plane of the scaled unit ball: normal n / r, moved to the centre.
+    # A plane of the unit ball, scaled by r and moved to the centre, has the normal n / r.
     normals = normals / np.asarray(radii)
     length = np.linalg.norm(normals, axis=1)
     normals /= length[:, None]
@@ -121,10 +121,10 @@ def rock(rng: Rng, centre: ArrayLike, radii: ArrayLike) -> Shape:
 def vessel(
     bottom: float, top: float, radius: float, top_radius: float, wall: float, floor: float = 0.0
 ) -> Shape:
-    """Return an upright hollow frustum, with a floor where `floor` is not 0.
+    """Return an upright hollow frustum, with a floor if `floor` is not 0.
 
-    The hollow extends well beyond the ends, so that the distance bound is not near zero where only
-    the ends' planes are near.
+    The hollow extends beyond open ends; otherwise the distance bound would be near zero on the
+    planes of these ends, away from the surface.
     """
     slope = (top_radius - radius) / (top - bottom)
     low, high = bottom + (floor or -0.2), top + 0.2
@@ -138,7 +138,7 @@ def vessel(
 
 
 def pot(rng: Rng, radius: float, height: float, outside: Stuff, filling: Stuff) -> list[Part]:
-    """Return a pot standing on z = 0, filled up to four fifths."""
+    """Return a pot that stands on z = 0 and is four fifths full."""
     foot = radius * rng.uniform(0.65, 0.8)
     wall = 0.13 * radius
     level = 0.8 * height

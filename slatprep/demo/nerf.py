@@ -1,8 +1,8 @@
-"""What the density of a NeRF does to an object on PixieVerse's grid.
+"""Degrade an object on PixieVerse's grid, as the density of a NeRF does.
 
-A grid is damaged, or all of it replaced by a field that is thicker than the object and rough, with
-hollows inside and floating blobs. Some thin parts of that are missing, and some fields include a
-piece of the ground.
+`damage` changes a few places of a grid. `nerf_field` replaces all of it by a field that is rough
+and thicker than the object, with hollows and floating blobs. Some thin parts are missing, and some
+fields include a piece of the ground.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from slatprep.geometry.voxels import boundary
 from slatprep.records import RESOLUTION
 
 EMPTY, UNLABELLED = -1, -2
-"""Stuff of an empty voxel, and of one that is occupied but has no label."""
+"""Stuff of an empty voxel, and of an occupied voxel without a label."""
 
 THICKENING = 0.5
-"""Distance [voxel] of the surface outside that of the exact grid.
+"""Mean distance [voxel] of the field's surface outside the surface of the exact grid.
 
-The exact grid is itself thicker than the object, since all voxels on the surface are filled.
+The exact grid is itself thicker than the object, because all voxels on the surface are filled.
 """
 
 ROUGHNESS = 0.6
-"""Standard deviation [voxel] of the surface, which is cut at `_MOST_ROUGH` deviations."""
+"""Standard deviation [voxel] of the surface's distance, clipped at `_MOST_ROUGH` deviations."""
 
 GROUND_SHARE = 1.0 / 3.0
 """Share of the assets with a slab of ground."""
 
 _MOST_ROUGH = 2.0
-_THIN = 1.5  # Half the thickness [voxel] below which a part may be lost.
-_MOST_LOST = 0.15  # Largest share of an object to lose with its thin parts.
+_THIN = 1.5  # Half the thickness [voxel] below which a part may be removed.
+_MOST_LOST = 0.15  # Largest share of an object that is removed with its thin parts.
 
 
 def damage(
@@ -46,8 +46,8 @@ def damage(
 ) -> NDArray[np.int16]:
     """Remove pieces of a grid (64, 64, 64) of stuff indices, and add two to four floaters.
 
-    `distance` is a bound of the solid in the grid's frame. Floaters get one of `stuffs` stuffs; one
-    of them is `UNLABELLED`.
+    `distance` is the solid's distance bound in the grid's frame. The first floater is `UNLABELLED`;
+    each of the others gets one of `stuffs` stuffs.
     """
     damaged = stuff.copy()
     skin = np.argwhere(boundary(stuff >= 0))
@@ -67,8 +67,8 @@ def nerf_field(
 ) -> NDArray[np.int16]:
     """Degrade an exact grid (64, 64, 64) of stuff indices as a NeRF's density would.
 
-    The unit vector `up` (3,) points up from the ground. Blobs and ground get one of `stuffs`
-    stuffs; the voxels of one blob are `UNLABELLED`.
+    The unit vector `up` (3,) points up from the ground. The first blob is `UNLABELLED`; each other
+    blob and the ground get one of `stuffs` stuffs.
     """
     kept = _without_thin_parts(rng, stuff >= 0)
     away, nearest = ndimage.distance_transform_edt(~kept, return_indices=True)
@@ -84,26 +84,26 @@ def nerf_field(
 
 
 def _smooth_noise(rng: Rng, sigma: float) -> NDArray[np.float64]:
-    """Return noise (64, 64, 64) of mean 0 and deviation 1, smooth over `sigma` voxels."""
+    """Return noise (64, 64, 64), smoothed over `sigma` voxels, of mean 0 and deviation 1."""
     noise = ndimage.gaussian_filter(rng.normal(size=(RESOLUTION,) * 3), sigma)
     return np.asarray((noise - noise.mean()) / noise.std())
 
 
 def _without_thin_parts(rng: Rng, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Remove some of the pieces that a ball of radius `_THIN` does not fit into."""
+    """Remove some of the pieces into which a ball of radius `_THIN` does not fit."""
     core = ndimage.distance_transform_edt(occupied) > _THIN
     opened = ndimage.distance_transform_edt(~core) <= _THIN
     thin = occupied & ~opened & (_smooth_noise(rng, 4.0) > 0.0)
     pieces, count = ndimage.label(thin, np.ones((3, 3, 3)))
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
     order = rng.permutation(count)
-    # An object of mostly thin parts, such as grass, must not lose most of them.
+    # An object with mostly thin parts, such as grass, must not lose most of them.
     lost = order[np.cumsum(sizes[order]) <= _MOST_LOST * occupied.sum()]
     return np.asarray(occupied & ~np.isin(pieces, lost + 1))
 
 
 def _ball(centre: NDArray[np.integer], radii: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the voxels (64, 64, 64) of an ellipsoid with axes along the grid's, in voxels."""
+    """Return the occupancy (64, 64, 64) of an axis-parallel ellipsoid; arguments are in voxels."""
     x, y, z = (((np.arange(RESOLUTION) - c) / r) ** 2 for c, r in zip(centre, radii, strict=True))
     return np.asarray(x[:, None, None] + y[:, None] + z < 1.0)
 
@@ -123,7 +123,7 @@ def _add_ground(
     up: NDArray[np.float64],
     stuff: int,
 ) -> None:
-    """Add a round slab at the object's foot, as far as the grid reaches."""
+    """Add a round slab of one stuff at the object's foot, cut off by the grid."""
     centres = voxel_centres(np.argwhere(np.ones_like(occupied))) / VOXEL_SIZE
     height = (centres @ up).reshape(occupied.shape)
     foot = float(height[occupied].min())
@@ -138,7 +138,7 @@ def _add_ground(
 
 
 def _add_blobs(rng: Rng, field: NDArray[np.int16], away: NDArray[np.float64], stuffs: int) -> None:
-    """Add blobs in empty space, one of them without a label."""
+    """Add blobs in empty space; the first has no label."""
     free = np.argwhere((away > 4.5) & (field == EMPTY))
     for k in range(rng.integers(3, 8) if len(free) else 0):
         blob = _ball(free[rng.integers(len(free))], rng.uniform(1.0, 3.0, 3))

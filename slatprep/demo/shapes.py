@@ -1,8 +1,8 @@
-"""Primitive solids as signed distance bounds, and their materials.
+"""Define primitive solids as signed distance bounds, and their materials.
 
 Every shape gives a number at any point: negative inside, positive outside, and never larger in
-magnitude than the distance to its surface. The voxelisation relies on that bound. A shape also
-gives its support function, from which exact bounding boxes follow in any orientation.
+magnitude than the distance to its surface. The voxelisation relies on this bound. A shape also
+has a support function, which gives exact bounding boxes in any orientation.
 
 The distance functions follow Inigo Quilez, "Distance functions"
 (https://iquilezles.org/articles/distfunctions/).
@@ -77,7 +77,7 @@ def dome(centre: ArrayLike, radii: ArrayLike) -> Shape:
 
 
 def capsule(start: ArrayLike, end: ArrayLike, radius: float) -> Shape:
-    """Return all points within `radius` of a segment."""
+    """Return the solid of all points within `radius` of a segment."""
     a, b = _vector(start), _vector(end)
     axis = b - a
 
@@ -89,7 +89,7 @@ def capsule(start: ArrayLike, end: ArrayLike, radius: float) -> Shape:
 
 
 def cone(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float) -> Shape:
-    """Return a frustum with flat ends, of `radius` at `start` and `end_radius` at `end`."""
+    """Return a frustum with flat ends: `radius` at `start`, `end_radius` at `end`."""
     a, b = _vector(start), _vector(end)
     length = float(np.linalg.norm(b - a))
     axis = (b - a) / length
@@ -116,7 +116,7 @@ def cylinder(start: ArrayLike, end: ArrayLike, radius: float) -> Shape:
 def box(
     centre: ArrayLike, half: ArrayLike, rotation: ArrayLike | None = None, rounding: float = 0.0
 ) -> Shape:
-    """Return a box of half edges `half` (rounding included) with rounded edges."""
+    """Return a box with half edges `half`, which include the rounding of its edges."""
     c, h = _vector(centre), _vector(half) - rounding
     axes = np.eye(3) if rotation is None else _vector(rotation)
 
@@ -148,7 +148,7 @@ def torus(centre: ArrayLike, axis: ArrayLike, radius: float, thickness: float) -
 def polytope(normals: ArrayLike, offsets: ArrayLike) -> Shape:
     """Return the intersection of half-spaces ``normal @ p <= offset``; it must be bounded.
 
-    `normals` (F, 3) are unit vectors outwards, `offsets` (F,) the planes' distances from the
+    `normals` (F, 3) are outward unit vectors; `offsets` (F,) are the planes' distances from the
     origin.
     """
     n, o = _vector(normals), _vector(offsets)
@@ -160,17 +160,17 @@ def polytope(normals: ArrayLike, offsets: ArrayLike) -> Shape:
             if np.all(n @ corner <= o + 1e-9):
                 corners.append(corner)
     vertices = np.array(corners)
-    # The greatest plane distance is no greater than the distance to the solid.
+    # The largest distance to a plane is at most the distance to the solid.
     return Shape(lambda p: (p @ n.T - o).max(axis=1), lambda d: float((vertices @ d).max()))
 
 
 def carve(solid: Shape, tool: Shape) -> Shape:
-    """Return `solid` less `tool`; the tool must leave the solid's bounding box as it is."""
+    """Return `solid` minus `tool`; the tool must not change the solid's bounding box."""
     return Shape(lambda p: np.maximum(solid.distance(p), -tool.distance(p)), solid.support)
 
 
 def half_space(point: ArrayLike, normal: ArrayLike) -> Region:
-    """Return a region that is negative on the side of a plane that `normal` points to."""
+    """Return a region that is negative on the side of a plane to which `normal` points."""
     q, n = _vector(point), _vector(normal)
     return lambda p: -((p - q) @ n)
 
@@ -186,7 +186,7 @@ class Stuff(NamedTuple):
 
 @dataclass(frozen=True)
 class Part:
-    """A shape of one stuff; each coat replaces the stuff where its region is negative."""
+    """A shape of one stuff; a coat replaces the stuff at points where its region is negative."""
 
     shape: Shape
     stuff: Stuff
@@ -196,16 +196,16 @@ class Part:
 class Solid:
     """The union of at least one part, with the distance and the stuff at any point.
 
-    A point belongs to the part whose distance is smallest there. Distances are computed up to the
-    share `reach` of the largest edge of the solid's box.
+    A point belongs to the part with the smallest distance at the point. Distances are computed up
+    to the share `reach` of the largest edge of the solid's box.
     """
 
     def __init__(self, parts: Sequence[Part], reach: float = 0.08) -> None:
         self.parts = tuple(parts)
         self.shapes = tuple(part.shape for part in self.parts)
         self.extent = bounding_box(self.shapes, np.eye(3))
-        # A part is evaluated only near its own box. Elsewhere its distance is at least this,
-        # and the voxelisation needs no more.
+        # A part is evaluated only near its own box. Elsewhere its distance is at least `reach`,
+        # and the voxelisation needs no larger distances.
         self.reach = reach * float((self.extent[1] - self.extent[0]).max())
         self._boxes = [bounding_box([shape], np.eye(3)) for shape in self.shapes]
         self.stuffs: list[Stuff] = []
@@ -215,7 +215,7 @@ class Solid:
             self.stuffs += [part.stuff, *(stuff for _, stuff in part.coats)]
 
     def evaluate(self, points: Points) -> tuple[Points, NDArray[np.intp]]:
-        """Return the signed distance bound (P,), at most `reach`, and the part (P,), -1 beyond."""
+        """Return the signed distance bound (P,), at most `reach`, and the part (P,) or -1."""
         best = np.full(len(points), self.reach)
         owner = np.full(len(points), -1, dtype=np.intp)
         x, y, z = np.ascontiguousarray(points.T)
@@ -236,7 +236,7 @@ class Solid:
         return self.evaluate(points)[0]
 
     def stuff_at(self, points: Points) -> NDArray[np.intp]:
-        """Return the index into `stuffs` (P,) at points inside or near the surface."""
+        """Return the index (P,) into `stuffs` at points inside the solid or near its surface."""
         owner = self.evaluate(points)[1]
         if np.any(owner < 0):
             raise ValueError("a point too far from the solid has no part")

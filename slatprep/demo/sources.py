@@ -1,7 +1,7 @@
-"""Demo data in the layouts of other sources than PixieVerse.
+"""Write demo data in the layouts of sources other than PixieVerse.
 
-`write_vomp`, `write_physxnet` and `write_voxels` take plain arrays, so that they can write other
-data in these layouts too.
+`write_vomp`, `write_physxnet` and `write_voxels` take plain arrays, so that they can also write
+other data in these layouts.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ Source = Literal[
     "pixieverse", "pixie-predictions", "pixie-prediction-ids",
     "vomp", "physxnet", "voxels-npz", "voxels-hdf5", "voxels-zarr", "voxels-ply",
 ]  # fmt: skip
-"""Sources, and their forms, that the annotated side of a demo can have."""
+"""Source of a demo's annotated side, with its form."""
 
 ONE_FRAME = ("vomp", "physxnet")
-"""Sources whose voxels come from the mesh that was encoded to latents."""
+"""Sources whose voxels come from the same mesh as the latents."""
 
 CLASSES = ("elastic", "metal", "granular", "viscous", "liquid", "snow", "rigid")
-"""Names of the classes 0 to 6 in plain voxels of a demo."""
+"""Names of the classes 0 to 6 in a demo's plain voxels."""
 
 # Columns: friction angle, damping, restitution, friction, and the two conductivities.
 _BY_CLASS = np.array([
@@ -52,17 +52,17 @@ TABLE: tuple[dict[str, Any], ...] = (
     {"name": "thermal_conductivity", "unit": "W/(m K)", "scale": "log10"},
     {"name": "electrical_conductivity", "unit": "S/m", "scale": "log10"},
 )
-"""The properties of plain voxels of a demo, in the form of ``source.json``."""
+"""Properties of a demo's plain voxels, in the form of ``source.json``."""
 
 
 def columns_of(
     source: Source, material: NDArray[Any], properties: NDArray[np.float32]
 ) -> dict[str, NDArray[np.float32]]:
-    """Return the properties (K,) of voxels that a source has, by name and in SI units.
+    """Return the properties (K,) that a source has, by name, in SI units.
 
     `material` (K,) are classes 0..6, `properties` (K, 3) Young's modulus, density and Poisson's
-    ratio. The other properties follow: a yield stress of 1 % of the modulus, and values by class,
-    multiplied by 0.5 to 1.5 depending on Poisson's ratio.
+    ratio. Other properties are computed: the yield stress is 1 % of the modulus, the rest are
+    values by class, multiplied by 0.5 to 1.5 depending on Poisson's ratio.
     """
     known = dict(zip((one.name for one in PROPERTIES), properties.T, strict=True))
     if source == "physxnet":
@@ -78,7 +78,7 @@ def columns_of(
 
 
 def classes_of(source: Source) -> tuple[str, ...]:
-    """Return the classes of plain voxels of a demo; those in HDF5 have none."""
+    """Return the classes of a demo's plain voxels; HDF5 has none."""
     return () if source == "voxels-hdf5" else CLASSES
 
 
@@ -87,8 +87,8 @@ def write_field(
 ) -> None:
     """Write the annotated side of an object, for any source but Pixie's.
 
-    `grid` (64, 64, 64, 4) has PixieVerse's form; voxels of class -1 are left out. `surface` (N, 3)
-    are the voxels of its SLAT, which PhysXNet annotates.
+    `grid` (64, 64, 64, 4) has PixieVerse's format; voxels of class -1 are omitted. `surface` (N, 3)
+    are the voxels of the object's SLAT, which PhysXNet annotates.
     """
     known = (grid[..., 3] >= 0) & (grid[..., 3] < BACKGROUND)
     voxels = np.argwhere(known)
@@ -110,7 +110,7 @@ def write_field(
 def write_vomp(
     root: Path, name: str, voxels: NDArray[Any], columns: Mapping[str, NDArray[np.float32]]
 ) -> None:
-    """Write voxels (K, 3) of 64^3 as VoMP does: a structured array of lower corners."""
+    """Write voxels (K, 3) of 64^3 as VoMP does, in a structured array with their lower corners."""
     names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
     rows = np.zeros(len(voxels), [*((key, "<f4") for key in names), ("segment_id", "<U32")])
     for key, axis in zip("xyz", voxels.T, strict=True):
@@ -131,9 +131,9 @@ def write_physxnet(
         (root / folder).mkdir(parents=True, exist_ok=True)
     rows = np.full((len(voxels), 14), -1.0)
     rows[:, 0] = 30.0  # the object's largest dimension [cm]
-    rows[:, 1] = 1.0  # rank of the part by how likely it is touched
+    rows[:, 1] = 1.0  # rank of the part by its probability of being touched
     rows[:, 2] = density / 1000.0  # g/cm^3
-    rows[:, 3] = rows[:, 13] = 0.0  # the group that moves together, and how it does
+    rows[:, 3] = rows[:, 13] = 0.0  # the group that moves together, and its kind of motion
     np.save(root / "property" / f"{name}2.npy", rows)
     write_points(root / "voxels" / f"{name}.ply", {
         axis: ((one + 0.5) / 64.0 - 0.5).astype(np.float32)
@@ -142,7 +142,7 @@ def write_physxnet(
 
 
 def write_points(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write a binary PLY of points with a property for each column (K,)."""
+    """Write points as a binary PLY with a property for each column (K,)."""
     dtype = np.dtype([(key, array.dtype.newbyteorder("<")) for key, array in columns.items()])
     write_ply(path, np.rec.fromarrays(list(columns.values()), dtype=dtype))
 
@@ -153,7 +153,7 @@ def write_description(
     classes: tuple[str, ...] | bool,
     **others: object,
 ) -> None:
-    """Write ``source.json`` of plain voxels, with names for its classes or without classes."""
+    """Write ``source.json`` of plain voxels, with the names of its classes, if it has any."""
     root.mkdir(parents=True, exist_ok=True)
     about = {"properties": properties, "classes": classes or False, **others}
     write_json(root / "source.json", about)
@@ -165,7 +165,7 @@ def write_json(path: Path, value: object) -> None:
 
 
 def write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], below: str = "") -> None:
-    """Write arrays to a file of their own, or add them to a file `below` a group, ``name/``."""
+    """Write arrays to a new file, or add them to a file, in the group `below` (``name/``)."""
     import h5py
 
     with h5py.File(path, "a" if below else "w") as file:
@@ -176,7 +176,7 @@ def write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], below: str = "") 
 def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write plain voxels of an object: ``voxels`` (K, 3) and a column (K,) for each property.
 
-    `form` is ``npz``, ``hdf5``, ``zarr`` or ``ply``, with the centres of the voxels as points.
+    `form` is ``npz``, ``hdf5``, ``zarr`` or ``ply``; a PLY has the voxels' centres as points.
     """
     root.mkdir(parents=True, exist_ok=True)
     if form == "npz":
@@ -188,7 +188,7 @@ def write_voxels(root: Path, name: str, form: str, arrays: Mapping[str, NDArray[
 
         group = zarr.open_group(root / f"{name}.zarr", mode="w", zarr_format=3)
         for key, array in arrays.items():
-            # All chunks: one that is missing later is then known to be lost.
+            # With all chunks written, a chunk that is missing later is known to be lost.
             group.create_array(
                 key, data=np.ascontiguousarray(array), config={"write_empty_chunks": True}
             )

@@ -2,7 +2,7 @@
 
 TRELLIS voxelises the surface of a mesh (Open3D's ``create_from_triangle_mesh_within_bounds``): a
 voxel is occupied if the surface meets its cube. Here the surface is the zero set of a signed
-distance bound, and subdivided cubes show whether they meet it.
+distance bound, and cubes are subdivided to find whether they meet it.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def voxelise(
     """Return the surface voxels and the filled voxels of a solid, (side, side, side) each.
 
     `distance` maps points (P, 3) of the cube [-0.5, 0.5]^3 to (P,): positive outside, otherwise
-    negative or zero, in magnitude at most the distance to the surface. It may be cut off above half
-    the diagonal of a block of 4 voxels of 64, 0.054. `side` is 64 or a multiple.
+    negative or zero, in magnitude at most the distance to the surface. It may be cut off at any
+    value above 0.054, half the diagonal of a block of 4 voxels of 64. `side` is a multiple of 64.
 
     A cube whose centre is farther from the surface than half its diagonal does not meet it; a cube
-    with points on both sides does. All others are halved three times. This misses only a surface
+    with points on both sides does. Other cubes are halved three times. This misses only a surface
     that enters a cube by less than a tenth of a voxel, between the sampled points.
     """
     near, inside = _near_voxels(distance, side)
@@ -62,7 +62,7 @@ def _near_voxels(distance: Distance, side: int) -> tuple[NDArray[np.bool_], NDAr
 def _changes_sign(
     distance: Distance, voxels: NDArray[np.intp], inside: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return whether a corner is on the other side of the surface than the voxel's centre."""
+    """Return whether the surface separates a corner of each voxel from the voxel's centre."""
     corners = (voxels[:, None] + _CORNERS).reshape(-1, 3).T
     side = len(inside)
     lattice = np.zeros((side + 1,) * 3, dtype=bool)
@@ -76,7 +76,7 @@ def _changes_sign(
 def _subdivide(
     distance: Distance, voxels: NDArray[np.intp], inside: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return whether a cell centre of the halved cubes is on the other side of the surface."""
+    """Return whether the surface separates the centre of a halved cube from the voxel's centre."""
     met, own = np.zeros(len(voxels), dtype=bool), inside[tuple(voxels.T)]
     owner = np.arange(len(voxels))
     centres = voxel_centres(voxels, len(inside))

@@ -1,4 +1,4 @@
-"""Demo data on disk, in the layouts of PixieVerse and TRELLIS, and the truth."""
+"""Write demo data to disk, in the layouts of PixieVerse and TRELLIS, and the truth."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _CHANNELS = replace(PIXIE_RANGES, ranges=tuple(PIXIE_RANGES.ranges[k] for k in (
 
 
 def row_id(asset: DemoAsset, view: DemoView) -> str:
-    """Return the id of an asset's row: the object's, with the view if it has several."""
+    """Return the id of an asset's row: the object's id, plus the view if it has several."""
     return f"{asset.object_id}.{view.view}" if view.view else asset.object_id
 
 
 def slat_name(asset: DemoAsset, names: SlatNames) -> str:
-    """Return an object's name on the SLAT side: its id, or a sha256 as TRELLIS does."""
+    """Return an object's name on the SLAT side: its id, or a sha256 as in TRELLIS."""
     if names == "sha256":
         return hashlib.sha256(f"asset file of {asset.object_id}".encode()).hexdigest()
     return asset.object_id
@@ -46,7 +46,7 @@ def write_annotated(
 ) -> None:
     """Write the annotated side of an asset below `root`: a grid with mask and bounds, or voxels.
 
-    Of PixieVerse it has the grids of `samples`, if there are any, in place of the asset's.
+    For PixieVerse, the grids in `samples`, if given, replace the asset's grid.
     """
     folder = root / asset.object_id
     if source.startswith("pixie-"):
@@ -79,11 +79,11 @@ def _write_prediction(folder: Path, prediction: NDArray[np.float32], asset: Demo
 
 
 def _prediction(grid: NDArray[np.float32], scores: bool = True) -> NDArray[np.float32]:
-    """Return a grid as Pixie's network predicts it: channels first, classes as scores or ids."""
+    """Return a grid in the format of Pixie's network: channels first, classes as scores or ids."""
     values = grid[..., :3].astype(np.float64)
     values[..., :2] = np.log10(values[..., :2] + 1e-6)
     values = np.clip(normalize_mapped(values, _CHANNELS), -1.0, 1.0)
-    # A prediction has no class -1: voxels without a label become background.
+    # A prediction has no class -1, so voxels without a label become background.
     ids = np.where(grid[..., 3] < 0, BACKGROUND, grid[..., 3])
     classes = ids[..., None] == np.arange(8) if scores else ids[..., None]
     channels = np.concatenate([values, classes], axis=-1)
@@ -91,10 +91,10 @@ def _prediction(grid: NDArray[np.float32], scores: bool = True) -> NDArray[np.fl
 
 
 def write_results(root: Path, asset: DemoAsset) -> None:
-    """Write the prediction of a method with errors, in the layout of Pixie's results.
+    """Write a prediction with errors, in the layout of Pixie's results.
 
-    The field is shifted by up to a voxel along each axis, so it predicts background at its
-    boundary. Its properties have noise, for the whole field and for each voxel.
+    The field is shifted by up to a voxel along each axis, so it predicts background at the
+    object's boundary. Its properties have noise, for the whole field and for each voxel.
     """
     rng = np.random.default_rng(int.from_bytes(asset.object_id.encode(), "big"))
     shifted = np.roll(asset.grid, rng.integers(-1, 2, size=3), axis=(0, 1, 2))
@@ -105,7 +105,7 @@ def write_results(root: Path, asset: DemoAsset) -> None:
 
 
 SHAPE_LATENTS = "shape_latents/shape_enc_next_dc_f16c32_fp16"
-"""Where TRELLIS.2's toolkit puts the latents of a shape; the resolution follows."""
+"""Folder in which TRELLIS.2's toolkit puts shape latents, before ``_`` and the resolution."""
 
 
 def write_slat(
@@ -154,17 +154,17 @@ SPREAD = np.array([0.03, 0.15, 0.02])
 """Standard deviation of a part's log10 density, log10 Young's modulus and Poisson's ratio."""
 
 MISTAKEN = 0.15
-"""Probability that a part gets another class."""
+"""Probability that a part gets a class drawn at random."""
 
 _STREAM = 6
-"""Index of the random stream; those of `slatprep.demo.asset` come before."""
+"""Index of the random stream; `slatprep.demo.asset` uses the indices below."""
 
 
 def sample_grids(seed: int, index: int, asset: DemoAsset, samples: int) -> NDArray[np.float32]:
-    """Return annotations (samples, 64, 64, 64, 4) whose parts err as a language model errs.
+    """Return annotations (samples, 64, 64, 64, 4) with a language model's errors in each part.
 
     In each part, log density, log Young's modulus and Poisson's ratio are drawn about the true
-    values with `SPREAD`. A sample does not depend on the number of samples.
+    values with the deviations `SPREAD`. A sample does not depend on the number of samples.
     """
     known = (asset.grid[..., 3] >= 0) & (asset.grid[..., 3] != BACKGROUND)
     parts, part_of = np.unique(asset.grid[known], axis=0, return_inverse=True)
