@@ -9,13 +9,11 @@ from slatprep.errors import ConfigError
 from slatprep.parameters import AlignParameters
 from slatprep.records import Alignment, Engine, MaterialField, StructuredLatents
 
-_PACKAGES = {
-    "field": ("numpy", "scipy", "numba"),
-    "open3d": ("numpy", "open3d-cpu", "open3d"),
-    "small_gicp": ("numpy", "small_gicp"),
-    "known": ("numpy", "scipy", "numba"),
-}
-"""Packages that compute each engine's results."""
+_COMMON = "numpy", "scipy", "numba"
+"""Packages that compute with every engine: quality, look-up and judgement use them too."""
+
+_PACKAGES = {"open3d": ("open3d-cpu", "open3d"), "small_gicp": ("small_gicp",)}
+"""Packages that compute the results of an engine besides."""
 
 _EXTRAS = {"open3d": "paper", "small_gicp": "bench"}
 """Extra that installs the package of an engine."""
@@ -80,13 +78,13 @@ def require_engine(parameters: AlignParameters) -> None:
 
 
 def engine_versions(parameters: AlignParameters) -> dict[str, str]:
-    """Return the versions, by package, of the libraries that an engine computes with.
+    """Return the versions, by package, of the libraries that compute an asset with an engine.
 
     Raise ConfigError if the engine is not installed.
     """
     require_engine(parameters)
     versions = {}
-    for package in _PACKAGES[parameters.engine]:
+    for package in (*_COMMON, *_PACKAGES.get(parameters.engine, ())):
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

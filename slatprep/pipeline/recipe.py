@@ -72,18 +72,14 @@ class Recipe:
             return "code changed"
         old, new = source_digests(record.sources), source_digests(sources)
         roles = sorted(role for role in old | new if old.get(role) != new.get(role))
-        return f"sources changed: {', '.join(roles)}"
+        # The record does not tell units, adapter, encoder and plausibility, which the key has.
+        return f"sources changed: {', '.join(roles)}" if roles else "how sources are read changed"
 
 
 def recipe_of(parameters: BuildParameters) -> Recipe:
     """Return the recipe of a build."""
-    versions = {
-        "numpy": metadata.version("numpy"),
-        "scipy": metadata.version("scipy"),
-        **engine_versions(parameters.align),
-    }
     stages = StageParameters(parameters.align, parameters.sample)
-    return Recipe(stages, versions, code_fingerprint())
+    return Recipe(stages, engine_versions(parameters.align), code_fingerprint())
 
 
 @dataclass(frozen=True)
@@ -164,8 +160,14 @@ def origin(parameters: BuildParameters, versions: Mapping[str, str]) -> dict[str
     """Return what decides a store's bytes, without places of files, as its metadata hold it."""
     groups = ("align", "sample", "consensus", "witness", "normalize", "store")
     said = {group: getattr(parameters, group) for group in groups}
-    document = {"name": parameters.name, "parameters": said, "versions": versions}
-    return dict(orjson.loads(orjson.dumps(document)))
+    whole = {"name": parameters.name, "parameters": said, "versions": versions}
+    document = dict(orjson.loads(orjson.dumps(whole)))
+    # Of files the names alone: what they hold is in the store's ranges and in their source.
+    normalize = document["parameters"]["normalize"]
+    normalize["ranges"] = place_of(normalize["ranges"]).name
+    if is_split_file(by := normalize["split_by"]):
+        normalize["split_by"] = place_of(by).name
+    return document
 
 
 @lru_cache(maxsize=1)  # This takes longer than reading an asset.

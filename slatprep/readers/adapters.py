@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import entry_points
+from importlib import metadata
 from typing import Any, Protocol
 
 from slatprep import records
@@ -90,6 +90,9 @@ SOURCES = {
 }
 """slatprep's own source adapters."""
 
+LIBRARIES = {"parts": ("trimesh",)}
+"""Packages whose version decides what slatprep's own source adapters read."""
+
 
 def source_adapter(name: str) -> SourceAdapter:
     """Return the source adapter of this name; ConfigError if there is none or it does not load."""
@@ -111,8 +114,9 @@ def adapter_names(group: str) -> tuple[str, ...]:
 
 
 def made_by(group: str, name: str) -> str:
-    """Return the package of an adapter and its version; empty for slatprep's own."""
-    return _known(group).get(name, ("", None))[1] or ""
+    """Return the package of an adapter and its version; of slatprep's own, its `LIBRARIES`."""
+    own = " ".join(f"{one} {metadata.version(one)}" for one in LIBRARIES.get(name, ()))
+    return _known(group).get(name, ("", None))[1] or own
 
 
 @lru_cache(maxsize=64)
@@ -137,7 +141,7 @@ def _known(group: str) -> dict[str, tuple[str, str | None]]:
     """Return where each adapter of a group lies, and its package; None for slatprep's own."""
     own = SOURCES if group == "slatprep.sources" else dict.fromkeys(LATENTS, "")
     known: dict[str, tuple[str, str | None]] = {name: (own[name], None) for name in own}
-    for point in entry_points(group=group):
+    for point in metadata.entry_points(group=group):
         package = f"{point.dist.name} {point.dist.version}" if point.dist else ""
         known.setdefault(point.name, (point.value, package))
     return known

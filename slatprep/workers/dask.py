@@ -46,7 +46,7 @@ SHORTEST_BATCH_SECONDS = 0.25
 
 _LIBRARIES = (
     "numpy", "scipy", "numba", "open3d", "open3d-cpu", "small_gicp",
-    "h5py", "zarr", "numcodecs", "google-crc32c", "joblib",
+    "h5py", "zarr", "numcodecs", "google-crc32c", "joblib", "trimesh",
 )  # fmt: skip
 
 

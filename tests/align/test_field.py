@@ -32,7 +32,7 @@ from slatprep.geometry.frames import (
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.inspect.score import compare_with_truth
 from slatprep.parameters import PRESETS, AlignParameters, SampleParameters
-from slatprep.records import Verdict
+from slatprep.records import Engine, Verdict
 from slatprep.sample import sample
 
 DEFAULT = AlignParameters()
@@ -235,7 +235,8 @@ def test_threads_do_not_change_a_bit(tmp_path):
 
 
 def test_the_libraries_that_make_the_numbers_are_named():
-    assert {"numpy", "scipy", "numba"} <= set(engine_versions(DEFAULT))
+    for parameters in (DEFAULT, *(AlignParameters(engine=name) for name in Engine)):
+        assert {"numpy", "scipy", "numba"} <= set(engine_versions(parameters))
     assert "small_gicp" in engine_versions(AlignParameters(engine="small_gicp"))
     assert any("open3d" in name for name in engine_versions(AlignParameters(engine="open3d")))
 

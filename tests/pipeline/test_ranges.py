@@ -10,7 +10,9 @@ from support.synthetic import Dataset
 from support.trees import tree
 
 from slatprep import ConfigError, InputError, build_store, open_store
+from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, NormalizeParameters
+from slatprep.records import PROPERTY_COLUMNS
 from slatprep.store.record import BuildRecord
 from slatprep.store.record_json import read_record
 
@@ -88,6 +90,28 @@ def test_ranges_of_the_objects_to_train_on(make_dataset, tmp_path, ranges, bound
     lists.write_text(json.dumps({"train": ["a", "c"], "test": ["b"]}))
     build_store(chosen, out)
     np.testing.assert_allclose(ranges_of(out), expected(dataset, "ac", *bounds), rtol=1e-12)
+
+
+def test_files_that_moved_leave_the_store_as_it_is(make_dataset, tmp_path):
+    dataset, out = noisy(make_dataset(*"abc")), tmp_path / "s.zarr"
+    lists, spans = '{"train": ["a", "b"], "test": ["c"]}', "lo = 0.0\nhi = 9.0\n"
+    tables = "".join(f"[{name}]\n{spans}" for name in PROPERTY_COLUMNS)
+    for name, text, chosen in (
+        ("lists.json", lists, {"ranges": "p1-p99", "objects": "train", "split_by": "{}"}),
+        ("spans.toml", tables, {"ranges": "{}"}),
+    ):
+        builds = []
+        for place in ("here", "there"):
+            file = tmp_path / place / name
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(text)
+            said = {key: value.format(file) for key, value in chosen.items()}
+            summary = build_store(of(dataset, **said), out)
+            builds.append((summary.build_id, out.stat().st_ino))
+            assert verify_store(out).ok
+        assert builds[0] == builds[1]
+        build = open_store(out).attributes["build"]
+        assert name in str(build) and str(tmp_path) not in str(build)
 
 
 def test_by_hash_the_training_s_own_objects_count(make_dataset, tmp_path):

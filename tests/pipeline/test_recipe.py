@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,9 @@ from slatprep.pipeline import fingerprint
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.pipeline.fingerprint import code_fingerprint, numeric_modules
 from slatprep.pipeline.recipe import Recipe
+from slatprep.readers import reading_of
 from slatprep.readers.adapters import SOURCES
+from slatprep.records import SourceRoots
 from slatprep.store.record import AssetRecord, StageParameters
 from slatprep.store.record_json import read_record
 
@@ -48,7 +51,7 @@ def test_all_that_touches_the_numbers_is_in_the_key_and_no_order():
 
 def test_what_changed_is_said(record):
     same = Recipe(record.parameters, dict(record.versions), record.code)
-    assert same.difference(record, record.sources) == "sources changed: "
+    assert same.difference(record, record.sources) == "how sources are read changed"
     grid, slat = record.sources
     other = replace(slat, sha256="f" * 64)
     assert same.difference(record, (grid, other)) == f"sources changed: {slat.role}"
@@ -61,6 +64,13 @@ def test_what_changed_is_said(record):
     assert newer.difference(record, ()) == f"libraries changed: numpy was {was}, is 99.0"
     unknown = replace(same, versions={"small_gicp": "1.0"})
     assert unknown.difference(record, ()) == "libraries changed: small_gicp was None, is 1.0"
+
+
+def test_the_library_that_voxelises_parts_counts():
+    pytest.importorskip("trimesh")
+    roots = SourceRoots(Path("/a"), Path("/b"), adapter="parts")
+    assert reading_of(roots) == {"adapter": f"parts trimesh {metadata.version('trimesh')}"}
+    assert reading_of(replace(roots, adapter="voxels")) == {"adapter": "voxels "}
 
 
 def test_statements_count_and_words_do_not(tmp_path, monkeypatch):

@@ -20,10 +20,12 @@ from support.synthetic import Dataset, Made
 from support.trees import tree
 
 import slatprep
+from slatprep.align import engine_versions
 from slatprep.errors import SlatprepError
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
+from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import align_pairs, build_store, plan_build
+from slatprep.readers.adapters import LIBRARIES
 from slatprep.workers import dask as module
 from slatprep.workers.dask import Cluster
 from slatprep.workers.local import run_unordered
@@ -162,6 +164,11 @@ def test_a_worker_that_is_not_fit_is_refused_even_when_it_joins_late(shared, add
                 pass
         finally:
             end(unfit)
+
+
+def test_every_library_that_makes_numbers_must_be_the_same():
+    readers = {one for libraries in LIBRARIES.values() for one in libraries}
+    assert readers | set(engine_versions(AlignParameters())) <= dict(module._software()).keys()
 
 
 def test_a_worker_with_other_code_is_refused(shared, address, tmp_path):
