@@ -305,7 +305,7 @@ def _show_statistics(output: Output, found: StoreStatistics) -> None:
     output.record(f"{chosen}, weighted by {found.weight}", {**found.total.verdicts})
     output.table(
         "Voxels before and after the lookup",
-        ("group", "assets", "before", "share", "no label", "after", "share", "not valid"),
+        ("group", "assets", "before", "share", "unannotated", "after", "share", "not valid"),
         [
             (name, *_voxels(own))
             for name, own in groups.items()
