@@ -38,13 +38,14 @@ def evaluate(
 ) -> None:
     """Measure PREDICTIONS by Pixie's protocol.
 
-    PREDICTIONS is a folder with an npz for each asset, or a Zarr group or
-    HDF5 file with a group for each asset. Each has properties (N,3) in
-    normalised space, and may have material (N,) or logits (N,8), coords
-    (N,3), and ranges (3,2) if they differ from the store's. Errors are means
-    over valid voxels, then over objects. The exit code is 1 if an asset of
-    the split has no prediction. Beside the run.json of a training, the split
-    is that of the run, unless --split-by or --shares is given.
+    PREDICTIONS is a folder with an npz for each asset, the folder of a
+    training, or a Zarr group or HDF5 file with a group for each asset. Each
+    has properties (N,3) in normalised space, and may have material (N,) or
+    logits (N,8), coords (N,3), and ranges (3,2) if they differ from the
+    store's. Errors are means over valid voxels, then over objects. An asset
+    of the split with a bad prediction, or none, is named and left out, and
+    the exit code is 1. Beside the run.json of a training, the split is that
+    of the run, unless --split-by or --shares is given.
 
     Parameters
     ----------
@@ -76,18 +77,21 @@ def evaluate(
     """
     from slatprep.inspect.overview import UNKNOWN
     from slatprep.learn.metrics import OURS, SPREADS, evaluate_store
+    from slatprep.learn.predictions import predictions_of
     from slatprep.learn.published import TABLES, read_scores
 
     if predictions is None and not grids:
         raise click.UsageError("nothing to measure; give PREDICTIONS, --grids, or both")
     if picture is not None and not grids:
         raise click.UsageError("--picture draws methods side by side; give --grids as well")
+    predictions = predictions and predictions_of(predictions)
     folders = _folders_of_grids(grids)
     published = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
-    chosen = _selected(output, predictions, store, split, splits) | {"spread": spread}
     part = None if split == "all" else split
+    filters, left_out = _selected(output, predictions, store, split, splits)
+    chosen = filters | {"spread": spread}
     result: Evaluation | Comparison
     baselines: Measures = {}
     if grids:
@@ -95,11 +99,11 @@ def evaluate(
 
         result = compare_methods(predictions, folders, store, part, **chosen)
         measures = ours = result.methods
-        what, problems = "method", result.problems
-        if problems:
+        what = "method"
+        if result.problems:
             output.note(
                 "note:    assets without a usable prediction of some method, left out of all: "
-                f"{len(problems)}"
+                f"{len(result.problems)}"
             )
         if result.partly_annotated:
             output.note(
@@ -113,7 +117,6 @@ def evaluate(
         measures = {apart_from(n, others) or UNKNOWN: m for n, m in result.categories.items()}
         measures |= {"all": result.overall}
         ours, what = {OURS: result.overall}, "category"
-        problems = [f"{predictions}: no prediction of {name}" for name in result.missing]
         if result.converted:
             output.note(
                 "note:    predictions normalised by other ranges, converted to the store's: "
@@ -126,8 +129,8 @@ def evaluate(
 
         options.draw_to(output, picture, partial(draw_comparison, measures, SPREADS[spread]))
 
-    output.problems(problems, "--json lists them")
-    document = vars(result) | {"store": store}
+    output.problems(result.problems, "--json lists them")
+    document = vars(result) | {"store": store, "problems": result.problems + left_out}
     if beside:
         document["beside"] = [score for scores in published.values() for score in scores]
 
@@ -150,14 +153,15 @@ def evaluate(
             title = TABLES[name][0] if name in TABLES else name
             _show_beside(output, f"Beside {title}", means, scores)
 
-    output.result(document, show, complete=not problems)
+    output.result(document, show, complete=not result.problems)
 
 
 def _selected(
-    output: Output, predictions: Path | None, store: Place, split: str, splits: options.SplitOptions
-) -> dict[str, Any]:
-    """Return the split of each object and which assets count, by the options or else by a run."""
+    output: Output, predictions: Path | None, store: Place, split: Any, splits: options.SplitOptions
+) -> tuple[dict[str, Any], list[str]]:
+    """Return what chooses assets, by the options or else by a run, and a line on those left out."""
     from slatprep.learn.predictions import selection_of_run
+    from slatprep.learn.splits import select_assets
 
     filters: dict[str, Any] = {}
     rule, how = splits.rule, f"by {splits.rule['by']}"
@@ -168,7 +172,12 @@ def _selected(
     elif not splits.given:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
     opened = options.opened(store)
-    return {"splits": options.split_of_objects(output, opened, rule, f"{split}, {how}"), **filters}
+    of_object = options.split_of_objects(output, opened, rule, f"{split}, {how}")
+    part = None if split == "all" else split
+    rows, kept = (select_assets(opened, part, splits=of_object, **own) for own in ({}, filters))
+    without = {*rows.tolist()} - {*kept.tolist()}
+    left_out = options.note_left_out(output, opened, without, why=how)
+    return {"splits": of_object, **filters}, left_out
 
 
 def _folders_of_grids(grids: tuple[str, ...]) -> dict[str, Path]:

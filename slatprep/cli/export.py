@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -114,17 +115,21 @@ def export(
     from slatprep.export import ExportOptions, export_store
     from slatprep.records import USABLE
 
+    left_out: list[str] = []
     if split == "all" and splits.given:
         raise ConfigError("--split-by and --shares define splits; choose one with --split")
     if split != "all" and assets:
         raise ConfigError("--asset and --split both choose; give one of them")
     opened = options.opened(store)
     options.note_numbered(output, opened, assets)
+    rows: Sequence[int] = range(len(opened))
+    if split != "all":
+        rows = _of_split(output, opened, split, splits.rule)
     if verdicts is None and not assets:
-        options.note_left_out(output, opened)
+        left_out = options.note_left_out(output, opened, rows, USABLE)
         verdicts = USABLE
     if split != "all":
-        assets = _of_split(output, opened, split, splits.rule)
+        assets = tuple(opened.ids[row] for row in rows)
     with output.progress("export") as progress:
         summary = export_store(
             opened,
@@ -141,19 +146,20 @@ def export(
         output.note(note)
     cells = {name: getattr(summary, name) for name in ("format", "assets", "points", "files")}
     cells |= {"MB": summary.size / 1e6, "seconds": summary.seconds}
-    output.made(summary, lambda: output.record(f"Exported to {summary.path}", cells))
+    document = vars(summary) | {"problems": left_out}
+    output.made(document, lambda: output.record(f"Exported to {summary.path}", cells))
 
 
-def _of_split(output: Output, store: Store, split: Any, rule: dict[str, Any]) -> tuple[str, ...]:
-    """Return the assets of a split."""
+def _of_split(output: Output, store: Store, split: Any, rule: dict[str, Any]) -> list[int]:
+    """Return the rows of the assets in a split."""
     from slatprep.learn.splits import select_assets
 
     which = f"{split}, by {rule['by']}"
     splits = options.split_of_objects(output, store, rule, which)
-    rows = select_assets(store, split, splits=splits)
-    if not len(rows):
+    rows: list[int] = select_assets(store, split, splits=splits).tolist()
+    if not rows:
         raise ConfigError(f"{store.path}: no asset is in the split {which}")
-    return tuple(store.ids[row] for row in rows)
+    return rows
 
 
 @command()

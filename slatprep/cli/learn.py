@@ -130,7 +130,6 @@ def train(
     require_torch(device)
     import torch
 
-    from slatprep.learn.runs import LAST
     from slatprep.learn.train import TrainParameters
     from slatprep.learn.train import train as run
     from slatprep.records import USABLE
@@ -150,9 +149,10 @@ def train(
     torch.set_num_threads(threads or os.cpu_count() or 1)
     opened, rule = options.opened(store), splits.rule
     options.split_of_objects(output, opened, rule, f"by {rule['by']}")
+    left_out: list[str] = []
     if verdicts is None:
         verdicts = USABLE
-        options.note_left_out(output, opened)
+        left_out = options.note_left_out(output, opened, range(len(opened)), USABLE)
     chosen = TrainParameters(
         size=size,
         split_by=rule["by"],
@@ -166,8 +166,6 @@ def train(
         output.if_stopped = (
             "the same command goes on from the last checkpoint, at most 30 s and a step ago"
         )
-        if (directory / LAST).exists():
-            output.note(f"resumed: from {directory / LAST}; steps are counted from there")
         with (
             writing(str(directory), directory.parent),
             output.progress(f"train {name}", "steps") as steps,
@@ -180,6 +178,7 @@ def train(
                 workers=workers,
                 steps=steps,
                 progress=partial(_tell_epoch, output, name),
+                note=output.note,
             )
     for directory, summary in zip(runs.values(), summaries.values(), strict=True):
         if summary.diverged_in is not None:
@@ -188,7 +187,8 @@ def train(
                 f"no finite number; the weights of epoch {summary.best_epoch} are kept, and a "
                 "smaller --learning-rate into another --out may lead farther"
             )
-    output.made({"runs": summaries}, lambda: _show_training(output, summaries))
+    document = {"runs": summaries, "problems": left_out}
+    output.made(document, lambda: _show_training(output, summaries))
     output.note(f"runs:    {', '.join(str(directory) for directory in runs.values())}")
     first = next(iter(summaries.values()))
     output.note(f"next:    slatprep evaluate {first.predictions} --store {store}")

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import pkgutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -250,12 +250,20 @@ class ChosenOptions:
         return self.verdicts, self.categories
 
 
-def note_left_out(output: Output, store: Store) -> None:
-    """Print how many assets of a store are left out by the default verdicts."""
-    from slatprep.records import USABLE
-
-    if left := tally(one for one in store.column("verdict") if one not in USABLE):
-        output.note(f"left out: {left} (--verdict all takes them)")
+def note_left_out(
+    output: Output,
+    store: Store,
+    rows: Iterable[int],
+    kept: Collection[str] = (),
+    why: str = "--verdict all takes them",
+) -> list[str]:
+    """Print how many of the assets have no verdict that is kept; return the line, if any has."""
+    verdicts = store.column("verdict")
+    left = tally(one for row in rows if (one := verdicts[row]) not in kept)
+    lines = [f"left out: {left} ({why})"] if left else []
+    for line in lines:
+        output.note(line)
+    return lines
 
 
 def _at_most_the_cores(_context: click.Context, _parameter: click.Parameter, jobs: int) -> int:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError
+from slatprep.errors import InputError, amount
 from slatprep.geometry.frames import voxel_centres
 from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
 from slatprep.learn.splits import select_assets
@@ -95,6 +95,8 @@ class Evaluation:
         Scores over the objects of each category.
     missing : list of str
         Assets of the split without a prediction; they are not in the scores.
+    problems : list of str
+        Why assets of the split are not in the scores: they have no prediction, or a bad one.
     converted : int
         Assets whose prediction was normalised by other ranges and was converted to the
         store's.
@@ -107,6 +109,7 @@ class Evaluation:
     overall: Measure
     categories: dict[str, Measure]
     missing: list[str]
+    problems: list[str]
     converted: int = 0
     baselines: dict[str, Measure] = field(default_factory=dict)
 
@@ -184,40 +187,54 @@ def evaluate_store(
 ) -> Evaluation:
     """Measure predictions, as `open_predictions` reads them, against a store.
 
-    `slatprep.learn.splits.select_assets` takes split and filters. InputError if no asset of the
-    split has a prediction, or a prediction cannot be used.
+    `slatprep.learn.splits.select_assets` takes split and filters. Predictions that cannot
+    be used are left out and named. InputError if no asset of the split has one that can be used.
     """
     store = open_store(store_path)
     scored: dict[int, list[NDArray[np.float64]]] = {}
     missing: list[str] = []
+    bad: list[str] = []
     converted = 0
     trained = select_assets(store, "train", **filters).tolist()
     baselines = fit_baselines(store, trained) if trained else ()
     with open_predictions(predictions) as read:
         for index in select_assets(store, split, **filters).tolist():
             asset_id = store.ids[index]
-            arrays = read(asset_id)
-            if arrays is None:
-                missing.append(asset_id)
-                continue
-            rows = store.read(index, COLUMNS)
             source, ranges = f"{predictions}/{asset_id}", store.normalization
-            prediction = check_prediction(source, arrays, rows["coords"], ranges, store.contents)
+            rows = store.read(index, COLUMNS)
+            try:
+                arrays = read(asset_id)
+                if arrays is None:
+                    missing.append(asset_id)
+                    continue
+                coords = rows["coords"]
+                prediction = check_prediction(source, arrays, coords, ranges, store.contents)
+            except InputError as error:
+                bad.append(str(error))
+                continue
             converted += prediction.converted
             if not store.contents.classes:
                 prediction = replace(prediction, material=None)
             methods = prediction, *(one.predict(rows) for one in baselines)
             scored[index] = [score_asset(one, rows) for one in methods]
     if not scored:
+        where = f"of an asset of split {split or 'all'}"
+        if bad:
+            raise InputError(
+                predictions,
+                f"has {amount(len(bad), 'prediction')} {where}, and none can be used ({bad[0]})",
+                "normalised properties of every voxel",
+            )
         raise InputError(
             predictions,
-            f"has no prediction of an asset of split {split or 'all'}",
+            f"has no prediction {where}",
             f"ids of that split, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
         )
     names = [OURS, *(one.name for one in baselines)]
     beside, groups = average_methods(store, scored, names, spread)
     overall, categories = beside.pop(OURS), {name: own[OURS] for name, own in groups.items()}
-    return Evaluation(spread, overall, categories, missing, converted, beside)
+    problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
+    return Evaluation(spread, overall, categories, missing, problems, converted, beside)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,9 @@ RUN_FILE = "run.json"
 SPLITS_FILE = "splits.json"
 """The objects of each split, beside `RUN_FILE`."""
 
+PREDICTIONS = "predictions"
+"""The folder of the predictions of a training run, beside `RUN_FILE`."""
+
 RUN_BYTES = 2**20
 """Most bytes of a `RUN_FILE`."""
 
@@ -95,6 +98,12 @@ class _Selection:
     shares: Shares
     verdicts: tuple[Verdict, ...]
     max_ambiguity: Share | None
+
+
+def predictions_of(path: Path) -> Path:
+    """Return the predictions in the folder of a training run; any other path as it is."""
+    inside = path / PREDICTIONS
+    return inside if (path / RUN_FILE).exists() and inside.is_dir() else path
 
 
 def selection_of_run(predictions: Path) -> tuple[Path, dict[str, Any], dict[str, Any]] | None:

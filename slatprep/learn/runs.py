@@ -160,6 +160,11 @@ class Run:
         if not found:
             with staged(file) as path:
                 path.write_text(text, encoding="utf-8")
+        elif found.get("store") != wanted.get("store"):
+            raise ConfigError(
+                f"{file}: the run there is of another store, or of this one before it was built "
+                "anew; choose another --out"
+            )
         elif found != wanted:
             others = [
                 f"{name} {found.get(name)!r} instead of {wanted.get(name)!r}"

@@ -27,6 +27,7 @@ from slatprep.learn.predict import (
     predict,
     write_prediction,
 )
+from slatprep.learn.predictions import PREDICTIONS
 from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
 from slatprep.learn.splits import assign_store
 from slatprep.readers.files import refusing
@@ -146,12 +147,13 @@ def train(
     progress: Callable[[EpochRecord], None] | None = None,
     steps: Progress | None = None,
     stop_after: int | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> TrainSummary:
     """Train a decoder into the folder `out`, or resume a run that was stopped.
 
     On a CPU, a resumed run gets the same weights as an uninterrupted one; on a GPU the last bits
     may differ. `workers` processes read ahead. `steps` gets the number of batches done and of all,
-    in this call alone. The training stops after `stop_after` epochs, as if interrupted; it ends if
+    in this call alone. `note` gets a line if the run is resumed. The training stops after `stop_after` epochs, as if interrupted; it ends if
     it diverges. ConfigError if `out` holds another run, a split has no asset, or the training
     diverges before any epoch can be kept. InputError if a checkpoint is damaged.
     """
@@ -179,6 +181,8 @@ def train(
         if state is not None:
             with refusing(run.path / LAST, "cannot be read", "a checkpoint of this run"):
                 session.restore(state)
+            if note:
+                note(f"resumed: from {run.path / LAST}; steps are counted from there")
         while not session.finished and session.epoch != stop_after:
             train_loss, rate = session.run_epoch(steps, lambda: run.save(LAST, session.state()))
             record = EpochRecord(session.epoch, rate, train_loss, *session.validate())
@@ -205,7 +209,7 @@ def train(
                     errors.append(score_asset(one.predict(rows), rows)[-2])
                 references[one.name] = float(np.mean(errors))
             run.draw(session.history, references)
-        predictions = run.path / "predictions"
+        predictions = run.path / PREDICTIONS
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     diverged_in = session.epoch - 1 if session.diverged() else None
     return TrainSummary(session.history, session.best_epoch, references, predictions, diverged_in)

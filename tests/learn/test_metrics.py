@@ -118,6 +118,28 @@ def test_command(learn_store, predicted, tmp_path):
     assert last["method"] == "all" and last["means"] == pytest.approx(means)
 
 
+def test_bad_predictions_are_named_and_the_others_measured(learn_store, predicted, tmp_path):
+    some = Path(shutil.copytree(predicted["npz"], tmp_path / "some"))
+    for name, value, short in (("a", 0, 3), ("c", np.nan, 0), ("d", 7850, 0)):
+        with np.load(some / f"{name}.npz") as file:
+            properties = np.full_like(file["properties"], value)[short:]
+        np.savez(some / f"{name}.npz", properties=properties)
+    (some / "e.npz").unlink()
+    words = ("evaluate", some, "--store", learn_store, "--split", "all")
+    told = document(*words, code=1)
+    assert (told["overall"]["objects"], told["missing"], told["ok"]) == (4, ["e"], False)
+    shown = run(*words, code=1)
+    reasons = "no prediction of e", "has shape", "not all finite", "reach 7850"
+    for reason, problem in zip(reasons, told["problems"], strict=True):
+        assert reason in problem and problem in shown.stderr
+    assert "log10 density" in shown.stdout
+    for path in some.iterdir():
+        np.savez(path, properties=np.zeros((5, 3)))
+    said = refused(*words, code=1)
+    assert "has 8 predictions of an asset of split all, and none can be used" in said
+    assert "has shape (5, 3)" in said
+
+
 @pytest.mark.parametrize(("text", "message"), [
     ("method,log10 E,accuracy\nmine,0.1,\n", None),
     ("method,E\nmine,0.1\n", "has the columns method, E"),

@@ -266,12 +266,12 @@ def test_a_link_in_zarr_predictions_leads_nowhere_else(learn_store, tmp_path, li
         place.rename(target)
         place.symlink_to(target)
         if target.parent == tmp_path:
-            with pytest.raises(InputError, match="out of its root"):
-                evaluate_store(tmp_path / "p", learn_store, None)
+            (problem,) = evaluate_store(tmp_path / "p", learn_store, None).problems
+            assert "out of its root" in problem
             place.unlink()
             target.rename(place)
         else:
-            assert evaluate_store(tmp_path / "p", learn_store, None).missing == []
+            assert evaluate_store(tmp_path / "p", learn_store, None).problems == []
 
 
 MOST_BYTES = 100e6

@@ -152,7 +152,13 @@ def test_wrong_runs_are_named(learn_store, tmp_path):
     with pytest.raises(ConfigError, match=r"other parameters \(seed 1 instead of 2\)"):
         train(learn_store, out, dataclasses.replace(one, seed=2))
     (out / LAST).write_bytes(b"not a checkpoint")
+    said: list[str] = []
     with pytest.raises(InputError, match=r"last\.pt"):
+        train(learn_store, out, one, note=said.append)
+    assert said == []
+    run_file = out / "run.json"
+    run_file.write_text(json.dumps(json.loads(run_file.read_text()) | {"store": "x", "splits": ""}))
+    with pytest.raises(ConfigError, match=r"before it was built anew; choose another --out"):
         train(learn_store, out, one)
     with pytest.raises(ConfigError, match="holds no run"):
         train(learn_store, tmp_path, one)
@@ -341,10 +347,16 @@ def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_
     for options, count in (((), 3), (("--verdict", "all"), 4), (("--asset", "d"), 1)):
         out = ("--out", tmp_path / f"npz-{count}")
         exported = run("export", store, "--format", "npz", "--json", *out, *options)
-        assert json.loads(exported.stdout)["assets"] == count
-        assert ("left out: 1 failed" in exported.stderr) is (count == 3)
+        told, left = json.loads(exported.stdout), "left out: 1 failed (--verdict all takes them)"
+        assert (told["assets"], told["ok"]) == (count, True)
+        assert told["problems"] == ([left] if count == 3 else [])
+        assert (left in exported.stderr) is (count == 3)
     trained = run("train", store, "--out", tmp_path / "run", *SMALL, "--epochs", "1")
     assert "left out: 1 failed (--verdict all takes them)" in trained.stderr
+    # The folder of a run has its predictions, and chooses assets as the training did.
+    measured = run("evaluate", tmp_path / "run", "--store", store, "--split", "all", code=1)
+    assert f"left out: 1 failed (as {tmp_path / 'run/run.json'} says)" in measured.stderr
+    assert f"{tmp_path / 'run/predictions'}: no prediction of" in measured.stderr
     told = json.loads((tmp_path / "run" / "run.json").read_text())
     assert told["verdicts"] == ["good", "doubtful"]
 
