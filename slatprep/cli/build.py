@@ -391,7 +391,7 @@ def subset(
     wanted, opened = list(assets), options.opened(store)
     options.note_numbered(output, opened, assets)
     if chosen.verdicts or chosen.categories:
-        wanted += [asset.asset_id for asset in list_assets(opened, *chosen.of(opened))]
+        wanted += [asset.asset_id for asset in list_assets(opened, **vars(chosen))]
         if not wanted:
             there = tally(opened.column("verdict"))
             raise click.UsageError(f"no asset of {store} is of that kind; there are {there}")

@@ -165,7 +165,7 @@ def list_assets(
     from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)
-    listed = list(listed_of(opened, *chosen.of(opened), max_confidence))
+    listed = list(listed_of(opened, **vars(chosen), max_confidence=max_confidence))
     unusual = [] if ids else stored_oddities(opened)
 
     def show() -> None:
@@ -286,7 +286,7 @@ def stats(
     opened = options.opened(store)
     with output.progress("stats") as progress:
         found = store_statistics(
-            opened, *chosen.of(opened), weight=weight, jobs=jobs, progress=progress
+            opened, **vars(chosen), weight=weight, jobs=jobs, progress=progress
         )
     if csv_file is not None:
         write_csv(csv_file, COLUMNS, table_of(found))

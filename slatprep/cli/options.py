@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import pkgutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -236,18 +235,6 @@ class ChosenOptions:
         tuple[str, ...], ChoiceOf("slatprep.records:Verdict"), Click("--verdict")
     ] = ()
     categories: Annotated[tuple[str, ...], Click("--category")] = ()
-
-    def of(self, store: Store) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return both; refuse a category that no asset has, and suggest a similar one."""
-        known = sorted(set(map(str, store.column("category"))))
-        for category in self.categories:
-            if category not in known:
-                close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
-                expected = f"expected {', '.join(close)}" if close else "no category is known"
-                raise click.BadParameter(
-                    f"no asset has {category!r}; {expected}", param_hint="--category"
-                )
-        return self.verdicts, self.categories
 
 
 def note_left_out(

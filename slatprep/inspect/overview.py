@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import ConfigError
 from slatprep.judge import THRESHOLDS
 from slatprep.records import Normalization, Place, Verdict, words_of
 from slatprep.storage.place import storage_of
@@ -129,8 +131,16 @@ class ListedAsset:
 def rows_chosen(
     store: Store, verdicts: Collection[str] = (), categories: Collection[str] = ()
 ) -> list[int]:
-    """Return the rows of assets with these verdicts and categories; empty takes all."""
+    """Return the rows of assets with these verdicts and categories; empty takes all.
+
+    ConfigError if there is no such verdict, or no asset has such a category.
+    """
     categories, wanted = words_of(categories), store.with_verdicts(verdicts)
+    known = sorted(set(map(str, store.column("category"))))
+    for category in sorted(set(categories).difference(known)):
+        close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
+        expected = f"expected {', '.join(close)}" if close else "no category is known"
+        raise ConfigError(f"{store.path}: no asset has the category {category!r}; {expected}")
     return [
         row
         for row, category in enumerate(store.column("category"))

@@ -196,7 +196,7 @@ def store_statistics(
     Raises
     ------
     ConfigError
-        If there is no such `weight`.
+        If there is no such `weight` or verdict, or no asset has such a category.
     StoreError
         If the store cannot be read.
     """

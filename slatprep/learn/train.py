@@ -153,9 +153,10 @@ def train(
 
     On a CPU, a resumed run gets the same weights as an uninterrupted one; on a GPU the last bits
     may differ. `workers` processes read ahead. `steps` gets the number of batches done and of all,
-    in this call alone. `note` gets a line if the run is resumed. The training stops after `stop_after` epochs, as if interrupted; it ends if
-    it diverges. ConfigError if `out` holds another run, a split has no asset, or the training
-    diverges before any epoch can be kept. InputError if a checkpoint is damaged.
+    in this call alone, and `note` a line if the run is resumed. The training stops after
+    `stop_after` epochs, as if interrupted; it ends if it diverges. ConfigError if `out` holds
+    another run, a split has no asset, or the training diverges before any epoch can be kept.
+    InputError if a checkpoint is damaged.
     """
     opened = open_store(store, copy=True)
     assignment = assign_store(opened, parameters.split_by, parameters.shares)

@@ -234,3 +234,9 @@ def test_wrong_use_is_refused(store):
         assert told in refused("stats", store, option, value)
     with pytest.raises(ConfigError, match="weight is 'zz'; expected one of voxel, asset"):
         statistics.store_statistics(store, weight="zz")  # type: ignore[arg-type]
+    for filters, told in (
+        ({"verdicts": "nope"}, "verdict is 'nope'; expected one of good"),
+        ({"categories": ("a", "boat")}, "no asset has the category 'boat'; expected =b, a, b"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            statistics.store_statistics(store, **filters)
