@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from slatprep.align.quality import measure_quality
@@ -39,6 +40,7 @@ def take(
         deformation=None,
         figures=None,
         score=placement.score,
+        margin=math.nan,  # Its score may be below that of the placement that was left.
         placements=_apart_from(placement, (left, *others), latents),
         settled_by=by,
     )

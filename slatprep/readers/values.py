@@ -175,7 +175,9 @@ def _parts(
         column, unit = columns.get(known.name, (-1, ""))
         if column >= 0 and unit in ("1", *FACTORS):
             own[:, k] = to_si(sample[:, column], unit)
-    ids = np.zeros(len(own), int) if material is None else material[::step].astype(int)
+    ids = np.full(len(own), -1) if material is None else material[::step].astype(int)
+    if np.unique(ids, return_counts=True)[1].max() < _FEW * len(ids):
+        ids[:] = -1  # No class counts alone among so many: compare the object as a whole.
     parts = []
     for k in np.unique(ids):
         rows = own[ids == k]
@@ -184,7 +186,7 @@ def _parts(
             continue
         middle = len(rows) // 2
         medians = np.partition(rows, middle, axis=0)[middle].tolist()
-        name = classes[k] if material is not None and 0 <= k < len(classes) else ""
+        name = classes[k] if 0 <= k < len(classes) else ""
         parts.append(Part(name, share, *medians))
     return parts
 

@@ -107,6 +107,12 @@ def test_a_tie_goes_to_the_common_rotation_and_can_be_undone(boxed):
         np.testing.assert_array_equal(after.placements[0].transform, before.transform)
 
 
+def test_the_margin_of_a_placement_that_was_left_is_not_kept(boxed):
+    _, latents, before = boxed
+    after = take(before, 0, latents, _agreeing(6))
+    assert not np.isnan(before.margin) and np.isnan(after.margin)
+
+
 def test_whichever_placement_came_first_the_same_one_is_chosen(boxed):
     _, latents, found = boxed
     assert len(found.placements) == 3

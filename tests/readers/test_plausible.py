@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -17,7 +18,8 @@ from slatprep.demo.sources import Source
 from slatprep.errors import InputError
 from slatprep.parameters.files import load_parameters
 from slatprep.readers import discover, hash_sources, read_field
-from slatprep.records import MaterialField, Units
+from slatprep.readers.values import require_plausible, require_prediction
+from slatprep.records import PROPERTIES, MaterialField, SourceRoots, Units
 
 JELLY, METAL, SAND, VISPLAS, FLUID, SNOW, STATIONARY = range(7)
 
@@ -169,6 +171,21 @@ def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(read):
     field = read(*[(JELLY, 2e6, 930, 0.49)] * 4, (METAL, 200, 7850, 0.3))
     assert "class metal (20% of the voxels) has" in told(field)[0]
     assert len(field.voxels) == 5 * 1600
+
+
+def test_of_many_classes_the_object_is_looked_at_as_a_whole():
+    classes, roots = [f"c{k}" for k in range(25)], SourceRoots(Path("/a"), Path("/b"))
+    material = np.arange(1000) % len(classes)
+    for modulus in (2e-3, 2e6):
+        values = np.tile(np.array([[modulus, 930, 0.49]], np.float32), (1000, 1))
+        said = "x", values, material, PROPERTIES, classes, roots
+        if modulus > 1:
+            assert require_plausible(*said) == []
+            continue
+        with pytest.raises(InputError, match=r"look like GPa.*: the object has Young's modulus"):
+            require_plausible(*said)
+    with pytest.raises(InputError, match="is normalised"):
+        require_prediction("x", np.full((1000, 3), 1e6), material)
 
 
 def test_a_raw_grid_saved_channels_first_is_no_prediction(read):
