@@ -1,4 +1,4 @@
-"""The command line: it parses arguments and prints results."""
+"""Parse the command line's arguments and print results."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from slatprep.workers.local import THREAD_VARIABLES
 
 def main() -> None:
     """Run `slatprep`; the entry point of the console script."""
-    # Each process computes on one thread, so that only `--jobs` decides how many cores are
-    # used and no result depends on a thread count. Libraries read these variables when they
-    # are loaded; workers inherit them.
+    # Each process computes on one thread: only `--jobs` decides how many cores are used, and
+    # no result depends on a thread count. Libraries read these variables when they are loaded;
+    # workers inherit them.
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
-    # A batch system stops jobs with SIGTERM: clean up and exit as after Ctrl-C.
+    # Batch systems stop jobs with SIGTERM, which must clean up and exit like Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from slatprep.cli.streams import prepare_streams
 

@@ -1,4 +1,4 @@
-"""`slatprep make-demo`, `build-store`, `align`, which only aligns, `subset` and `concat`."""
+"""`slatprep make-demo`, `build-store`, `align`, `subset` and `concat`: make data and stores."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions:
-    """What `slatprep.demo.make_demo` makes.
+    """Options of `slatprep.demo.make_demo`.
 
     Attributes
     ----------
     assets
         Number of objects; fourteen have every category once.
     seed
-        The same seed gives the same bytes.
+        Seed of all random choices; the same seed gives the same bytes.
     levels
         Difficulty, 0 (quarter turns) to 4 (warped), 5 (a generated shape), 6 (a NeRF's field), 7
-        (both); may be repeated: assets take the levels in turn. [default: 0 to 4, or 0 where both
+        (both); may be repeated: assets take the levels in turn. [default: 0 to 4, or 0 if both
         sides share a frame]
     views
-        SLATs per object.
+        Number of SLATs per object.
     habitual_share
-        Share of the objects that have one quarter turn in common.
+        Share of the objects that have the same quarter turn.
     latents
         Noise with TRELLIS's statistics (placeholder), or latents that depend on the material.
     source
@@ -53,11 +53,11 @@ class DemoOptions:
     slat_names
         Name SLATs by object, or by sha256 with a metadata.csv.
     results
-        Also write results/: grids as predicted by a method with errors, 12 MB each, for `slatprep
-        evaluate --grids`.
+        Also write results/: grids predicted with errors, 12 MB each, for `slatprep evaluate
+        --grids`.
     samples
-        Annotations of each object; several have errors, part by part, and dataset.toml asks for a
-        merge.
+        Number of annotations of each object; several have errors in each part, and dataset.toml
+        merges them.
     """
 
     assets: options.Positive = 25
@@ -111,7 +111,7 @@ def make_demo(
 
 
 _ASSETS_PER_JOB = 32
-"""Assets that take the default engine as long as a worker takes to start, 1.6 s."""
+"""Number of assets that the default engine aligns in the start-up time of a worker, 1.6 s."""
 
 
 @command("build-store")
@@ -138,13 +138,13 @@ def build_store(
 ) -> None:
     """Build one store of aligned, normalised supervision, or bring it up to date.
 
-    Pairs the assets of both sides by id, aligns them, looks the material and
-    its properties up at every SLAT voxel, normalises and writes. An asset that
+    Pairs the assets of both sides by id, aligns them, looks up the material and
+    its properties at every SLAT voxel, normalises and writes. An asset that
     cannot be built does not stop the others: it is named on standard error and
     in the records, and the exit code is 1.
 
-    Assets whose sources, parameters and code did not change are not aligned
-    again: their rows are reused. An interrupted build is resumed.
+    If an asset's sources, parameters and code did not change, its row is reused
+    without aligning it again. An interrupted build is resumed.
 
     Parameters
     ----------
@@ -153,14 +153,14 @@ def build_store(
     consensus
         Settle ties by the rotation that most assets share.
     witness
-        Settle ties by comparing latents, and name assets whose labels they contradict.
+        Settle ties by comparing latents, and name assets whose latents contradict their labels.
     fresh
         Reuse nothing from an earlier build.
     rehash : [SHARE]
-        Share of the sources whose files look unchanged to hash, drawn at random; without a number,
-        all.
+        Hash this share, drawn at random, of the sources whose files look unchanged; without a
+        number, all of them.
     compact
-        Order rows by id, as a first build does; an update appends new assets.
+        Sort rows by id, as a first build does; otherwise an update appends new assets.
     keep_work
         Keep all assets' arrays beside the store, about 1 MB each, so that an update that packs all
         assets again does not read their sources.
@@ -168,7 +168,7 @@ def build_store(
         Measure errors on at most N decoys: grids aligned with SLATs of other objects, one for every
         20 assets that are aligned. 0: none.
     dry_run
-        Print what would be done, and why; write nothing.
+        Print what would be done with each asset, and why; write nothing.
 
     Example
     -------
@@ -230,7 +230,7 @@ def align(
     Parameters
     ----------
     out : FILE.jsonl
-        The file, with a record on each line.
+        File to write, with a record on each line.
     strict
         Stop at the first asset that cannot be aligned.
 
@@ -254,7 +254,7 @@ def align(
 
 
 def _counting(output: Output, progress: Progress) -> Progress:
-    """Return `progress` that also notes what a stopped build keeps."""
+    """Return `progress` that also updates the message for a stopped build."""
 
     def update(done: int, total: int) -> None:
         if done:
@@ -268,7 +268,7 @@ def _counting(output: Output, progress: Progress) -> Progress:
 
 
 def _by_work(output: Output, parameters: BuildParameters) -> dict[str, Any]:
-    """Return options that keep small builds from starting workers and report slow starts."""
+    """Return options that avoid workers for small builds, and print notes about slow starts."""
     per_job = _ASSETS_PER_JOB if parameters.align.engine == "field" else 1
     return {"assets_per_job": per_job, "note": output.note}
 
@@ -299,7 +299,7 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
 
 
 def _say_removed(count: int, taken_out: Mapping[str, str], there: str) -> None:
-    """Print how many assets leave the store, which are the first, and why."""
+    """Print the number of assets that leave the store, and the first three with reasons."""
     if count:
         named = [f"{name} ({why})" for name, why in islice(taken_out.items(), 3)]
         more = f" and {count - 3:,} more" if count > 3 else ""
@@ -319,7 +319,7 @@ def report(output: Output, summary: BuildSummary) -> None:
     for asset_id, reason in summary.problems:
         what, _, names = reason.partition(LOOKED_FOR)
         output.problem(f"{asset_id}: {what if names == looked else reason}")
-        looked = names or looked  # The same names are told once.
+        looked = names or looked  # Repeated names are printed once.
     total, good = sum(summary.statuses.values()), summary.statuses["ok"]
     for asset_id in summary.contradicted:
         output.note(f"{asset_id}: its latents contradict its labels; look at it first")
@@ -339,14 +339,14 @@ def report(output: Output, summary: BuildSummary) -> None:
             from slatprep.inspect.overview import list_assets, overview_of
 
             store, built = options.opened(summary.store), output.command == "build-store"
-            # What a dataset definition may say is of no use to `subset` and `concat`.
+            # Advice on dataset definitions is of no use to `subset` and `concat`.
             show_quality(output, overview_of(store), summary.store, advise=built)
             show_errors(store)
             if output.verbosity > 0:
                 names = ("asset_id", "verdict", "confidence", "fitness")
                 rows = map(attrgetter(*names), list_assets(store))
                 output.table("Assets", ("asset", *names[1:]), rows)
-        # "failed" beside the verdicts would be read as one of them, and "ok" as all but that.
+        # Beside the verdicts, "failed" would read as a verdict, and "ok" as all other verdicts.
         done = "aligned" if summary.store is None else "built"
         words = {"ok": done, "failed": f"not {done}"}
         others = ", ".join(f"{n:,} {words.get(key, key)}" for key, n in summary.statuses.items())
@@ -376,7 +376,7 @@ def subset(
     """Make a store of some assets of STORE, without aligning them again.
 
     Rows, records and ranges are copied unchanged. Assets must have one of the verdicts and
-    one of the categories; assets named by --asset are taken as well.
+    one of the categories; assets named by --asset are always included.
 
     Example
     -------
@@ -414,8 +414,8 @@ def concat(
     """Make one store of the assets of all STORES, without aligning them again.
 
     The stores must have been built with the same parameters, and no id may be in two
-    of them. If each has the ranges of its own dataset, properties are converted to the
-    ranges of all.
+    of them. If each has the ranges of its own dataset, properties are converted to
+    ranges over all assets.
 
     Example
     -------

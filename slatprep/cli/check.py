@@ -1,4 +1,4 @@
-"""`slatprep check-alignment`, `score` and `measure-errors`: how good alignments are."""
+"""`slatprep check-alignment`, `score` and `measure-errors`: check how good alignments are."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _FIGURES = ("confidence", "expected_accuracy", "fitness", "fitness_backward", "valid_share",
             "ambiguity")  # fmt: skip
-"""A line has room for six."""
+"""Figures in a line of the table, which has room for six."""
 
 
 @command("check-alignment")
@@ -42,24 +42,24 @@ def check_alignment(
     """Check whether the alignment of an asset of STORE is good, and draw it.
 
     Its quality is computed from the stored arrays, and its labels are looked up
-    again. Each figure agrees with the stored one if it differs by no more than
-    the tolerance. Changes are from a voxel's stored label to the one found now.
+    again. Each figure agrees with the stored figure if it differs by no more than
+    the tolerance. Changes are from a voxel's stored label to its new label.
     A picture shows both sides before and after from three
     directions, the error of every voxel, the candidates and the verdict.
     --asset, --worst and --ambiguous may be combined. The exit code is 1 unless
-    all are good and the store agrees with itself. Without STORE, the one that
-    `make align` built last under data/ is taken.
+    all alignments are good and the store is consistent. Without STORE, the
+    store that `make align` built last under data/ is used.
 
     Parameters
     ----------
     worst
-        The N worst assets: failed ones first, then doubtful ones, each by confidence.
+        Check the N worst assets: failed first, then doubtful, each sorted by confidence.
     ambiguous
-        Assets whose ties would change the class of more than 5 % of the voxels.
+        Check assets whose ties would change the class of more than 5 % of the voxels.
     picture : PATH|none
         A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside the store]
     show
-        Open it in Open3D's viewer, if there is a screen.
+        Open the alignment in Open3D's viewer, if there is a screen.
 
     Example
     -------
@@ -92,7 +92,7 @@ def check_alignment(
 
     measured = measured_errors(opened.path)
     if measured and not (measured.tells and measured.build == opened.about.manifest):
-        measured = None  # It tells nothing of an asset, or is of before an update.
+        measured = None  # It says nothing about single assets, or is older than an update.
     assets = []
     for one, file in zip_longest(checks, pictures):
         figures = [
@@ -182,7 +182,7 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
 
 
 def _open_viewer(output: Output, store: Store, asset_ids: list[str], file: Path | None) -> None:
-    """Open the viewer, or print why that is not possible and where the picture is."""
+    """Open the viewer, or print why it cannot open and where the picture is."""
     from slatprep.inspect.pictures.scene import scene_of
     from slatprep.inspect.pictures.viewer import has_screen, show_alignment
 
@@ -201,13 +201,12 @@ def score(output: Output, store: options.FolderOrUrl, truth_dir: options.Folder)
     """Score STORE against known truth.
 
     TRUTH_DIR holds an npz for each asset, as make-demo writes it. Figures of a
-    level leave out symmetric assets. Success is a mean displacement less than
+    level omit symmetric assets. Success is a mean displacement less than
     1.5 voxels above that of the best similarity. Displacement is the median,
     p90 the 90th percentile. Labels is the share of right classes; without
     classes, of right properties. Similarity displacement and similarity labels
-    are what the best similarity would give, true-place labels what the true
-    places would. The exit code is 1 if an asset with a truth is
-    not in the store.
+    are the figures of the best similarity; true-place labels are those of the
+    true places. The exit code is 1 if an asset with a truth is not in the store.
 
     Example
     -------
@@ -262,12 +261,12 @@ def measure_errors(
     picture: options.DrawnFile | None = None,
     jobs: options.Jobs = 1,
 ) -> None:
-    """Measure on decoys how many alignments of STORE show another object.
+    """Measure with decoys how many alignments of STORE show another object.
 
     A decoy is an asset's grid aligned with the SLAT of another object of about its size.
     Decoys show how wrong pairs of this dataset score. No asset of the store is
-    aligned again, and no verdict is changed. What decoys gave is kept beside the store, in
-    NAME.manifests/decoys.json, and taken over after an update. A build does the same with
+    aligned again, and no verdict changes. The results are kept beside the store, in
+    NAME.manifests/decoys.json, and reused after an update. A build does the same with
     fewer decoys.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The table of commands, and the group that imports each when it is used."""
+"""Define the table of commands, and the group that imports each command when it is used."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ GROUPS = {
         "diff": "slatprep.cli.verify:diff",
     },
 }
-"""Commands by what people do; to add a command, add its name and function here.
+"""Commands by group; to add a command, add its name and function here.
 
 `slatprep --help` imports all these modules, so they import heavy packages only when a command
 runs.
@@ -65,18 +65,18 @@ def _loaded(name: str) -> click.Command:
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command when it is used, and prints errors in one line."""
+    """A group that imports a command when it is used, and prints errors as one line."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names in the order of the table."""
+        """Return the commands' names in the order of the table."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import the command of that name."""
+        """Import the command named `cmd_name`."""
         return _loaded(cmd_name) if cmd_name in COMMANDS else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write what each command does, in as many lines as that takes: click cuts it to one."""
+        """Write each command's summary in full; click would cut it to one line."""
         widest = max(map(len, COMMANDS))
         for group, names in GROUPS.items():
             told = [
@@ -96,7 +96,7 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; print an expected error in one line and set the exit code."""
+        """Run the command; print an expected error as one line and set the exit code."""
         try:
             done = super().invoke(ctx)
         except OutputLostError:
@@ -107,7 +107,7 @@ class LazyGroup(click.Group):
                 output.EXIT_USAGE if isinstance(error, ConfigError) else output.EXIT_INCOMPLETE
             )
         except OSError as error:
-            # A disk, or an object store, that fails where no room has words of its own for it.
+            # A disk or an object store failed at a place without a message of its own.
             if error.filename is None:
                 raise
             say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
@@ -121,7 +121,7 @@ class LazyGroup(click.Group):
         return done
 
     def _fail_unprinted(self, ctx: click.Context) -> NoReturn:
-        """Say, on what is left to write to, that the result could not be printed."""
+        """Print on the remaining stream that the result could not be printed."""
         if not lost().startswith("standard error") or "--json" not in sys.argv:
             told = f"slatprep: error: {lost()}; the work is done, run it again to see the result"
             say(told, err="standard output" in lost())

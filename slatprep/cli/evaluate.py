@@ -1,4 +1,4 @@
-"""`slatprep evaluate`: the errors of predictions, beside those of others."""
+"""`slatprep evaluate`: measure the errors of predictions, beside those of other methods."""
 
 from __future__ import annotations
 
@@ -44,28 +44,28 @@ def evaluate(
     logits (N,8), coords (N,3), and ranges (3,2) if they differ from the
     store's. Errors are means over valid voxels, then over objects. An asset
     of the split with a bad prediction, or none, is named and left out, and
-    the exit code is 1. Beside the run.json of a training, the split is that
-    of the run, unless --split-by or --shares is given.
+    the exit code is 1. Predictions beside the run.json of a training take
+    the split of the run, unless --split-by or --shares is given.
 
     Parameters
     ----------
     store : STORE.zarr
         The store with the labels.
     grids : [NAME=]DIR
-        Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, of 11 or 4 channels;
-        may be repeated. They are measured on their own voxels and looked up at the SLAT's, on the
-        same objects as PREDICTIONS, which may be left out.
+        Grids predicted by Pixie or another method: DIR/ID/sample_0_pred.npy, with 11 or 4 channels;
+        may be repeated. They are measured on their own voxels and at the SLAT's voxels, on the same
+        objects as PREDICTIONS, which may be omitted.
     split
-        Only objects of this split.
+        Take only objects of this split.
     spread
-        Standard error or standard deviation over objects, or what Pixie prints.
+        Standard error or standard deviation over objects, or the spread that Pixie prints.
     csv_file
         Also write the table to this file.
     picture
         With --grids, also draw the table.
     beside : pixie|slat-phys|FILE.csv
         Also print the published scores of Pixie (with NeRF2Physics) or of SLAT-Phys, or a CSV with
-        names in the first column and columns named as here; may be repeated.
+        names in the first column and this table's column names; may be repeated.
 
     Example
     -------
@@ -159,7 +159,7 @@ def evaluate(
 def _selected(
     output: Output, predictions: Path | None, store: Place, split: Any, splits: options.SplitOptions
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return what chooses assets, by the options or else by a run, and a line on those left out."""
+    """Return the selection of assets, by the options or by a run, and lines on omitted assets."""
     from slatprep.learn.predictions import selection_of_run
     from slatprep.learn.splits import select_assets
 
@@ -181,7 +181,7 @@ def _selected(
 
 
 def _folders_of_grids(grids: tuple[str, ...]) -> dict[str, Path]:
-    """Return the folders of ``--grids`` by the method's name, by default the folder's name."""
+    """Return the folders of ``--grids`` by the method's name, which defaults to the folder's."""
     folders: dict[str, Path] = {}
     for text in grids:
         name, _, rest = text.rpartition("=")

@@ -1,4 +1,4 @@
-"""`slatprep export`, `publish` and `describe`: a store for other tools, hubs and catalogues."""
+"""`slatprep export`, `publish`, `describe`: write a store for other tools, hubs, catalogues."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ONLY_FOR = {
 
 @dataclass(frozen=True, kw_only=True)
 class FormatOptions:
-    """Options of some formats; None where the format's own default counts.
+    """Options of some formats; None takes the format's own default.
 
     Attributes
     ----------
@@ -42,14 +42,14 @@ class FormatOptions:
     frame
         ply: the SLAT's unit cube, or PixieVerse's world coordinates. [default: slat]
     shard_size
-        webdataset: assets a shard. [default: 256]
+        webdataset: assets per shard. [default: 256]
     latent_model : NAME
         npz: the encoder's name, latent_model in TRELLIS's configurations. [default: that of
         TRELLIS's published configurations]
     size : METRES
         usd: width of the unit cube. [default: 1]
     materials
-        usd: the most materials that E and nu of an asset are binned into. [default: 64]
+        usd: largest number of materials into which E and nu of an asset are binned. [default: 64]
     """
 
     points: Annotated[Any | None, options.ChoiceOf("slatprep.export.formats:Points")] = None
@@ -60,7 +60,7 @@ class FormatOptions:
     materials: options.Positive | None = None
 
     def of(self, kind: str) -> dict[str, Any]:
-        """Return those that were given; refuse one of another format."""
+        """Return the options that were given; refuse an option of another format."""
         given = {name: value for name, value in vars(self).items() if value is not None}
         for name in given:
             if kind not in _ONLY_FOR[name]:
@@ -84,7 +84,7 @@ def export(
     format_options: FormatOptions,
     jobs: options.Jobs = 1,
 ) -> None:
-    """Write assets of STORE in a format of other tools.
+    """Write assets of STORE in the format of another tool.
 
     Properties are in SI units in PLY, voxel_data and USD, normalised in WebDataset
     and npz, and both in HDF5. Every folder gets an index.json of its contents.
@@ -98,7 +98,7 @@ def export(
         The file (hdf5) or folder (all others); an existing export of the same format is replaced
         when the new one is complete.
     split
-        Only objects of this split, as `slatprep train` splits them.
+        Take only objects of this split, as `slatprep train` splits them.
 
     Example
     -------
@@ -175,9 +175,9 @@ def publish(
 ) -> None:
     """Write STORE as a dataset for a hub, such as Hugging Face's.
 
-    Writes a folder with the card (README.md, with statistics and a picture), the data, the
-    checksum of every file and, beside a store, the description that catalogues read
-    (croissant.json). Nothing is uploaded: the hub's own tool does that.
+    Writes a folder with the card (README.md, with statistics and a picture), the data and the
+    checksum of every file. With a store it also has the description that catalogues read
+    (croissant.json). Nothing is uploaded; use the hub's own tool.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def publish(
 
 
 def _picture(store: Store, count: int) -> bytes:
-    """Draw some assets, of as many categories as possible."""
+    """Draw `count` assets from as many categories as possible."""
     from slatprep.inspect.pictures.write import sheet_of
 
     seen: dict[str, int] = {}
@@ -253,7 +253,7 @@ def describe(
     out : FILE.json
         The file. [default: standard output]
     location : URL
-        Where its readers will find the store. [default: its path, as seen from the description]
+        Place where readers will find the store. [default: its path, relative to the description]
 
     Example
     -------

@@ -1,4 +1,4 @@
-"""`slatprep info`, `list`, `stats` and `report`: the contents of a store."""
+"""`slatprep info`, `list`, `stats` and `report`: show the contents of a store."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def info(output: Output, store: options.LastStore) -> None:
     """Show what is in STORE, and how good its alignments are.
 
-    Without STORE, the one that `make align` built last under data/ is taken.
+    Without STORE, the store that `make align` built last under data/ is used.
 
     Example
     -------
@@ -68,9 +68,10 @@ def info(output: Output, store: options.LastStore) -> None:
 def show_quality(
     output: Output, overview: StoreOverview, store: Place, *, advise: bool = True
 ) -> None:
-    """Print how good the alignments of a store are, which assets to look at, and how.
+    """Print how good a store's alignments are, and commands that show doubtful assets.
 
-    `store` is its place as it was typed: a version on an object store is gone two builds later.
+    `store` is the place as it was typed, because an object store deletes a version two builds
+    later.
     """
     from slatprep.inspect.overview import UNKNOWN
     from slatprep.judge import THRESHOLDS
@@ -102,7 +103,7 @@ def show_quality(
 
 
 def show_errors(store: Store) -> None:
-    """Print how many of a store's verdicts are wrong, as far as decoys said."""
+    """Print how many of a store's verdicts are wrong, as measured on decoys."""
     from slatprep.pipeline.decoys import told_of
 
     for sentence in told_of(store):
@@ -110,13 +111,13 @@ def show_errors(store: Store) -> None:
 
 
 def show_unusual(sentences: Iterable[str]) -> None:
-    """Print what is unusual of the sources of a store."""
+    """Print what is unusual about the sources of a store."""
     for sentence in sentences:
         say(f"unusual: {sentence}")
 
 
 def _source_of_categories(overview: StoreOverview) -> str:
-    """Say what gives a store the categories of its assets, as far as its records tell."""
+    """Return a hint about which file gives a store's assets their categories."""
     from slatprep.errors import StoreError
     from slatprep.storage.place import place_of
     from slatprep.store.records import build_in, found_manifests
@@ -145,13 +146,13 @@ def list_assets(
 ) -> None:
     """List the assets of STORE, with the reasons of their verdicts.
 
-    On a terminal ids are shortened to prefixes that no other id has; all commands accept
-    such prefixes. Without STORE, the one that `make align` built last under data/ is taken.
+    On a terminal, ids are shortened to unique prefixes, which all commands accept.
+    Without STORE, the store that `make align` built last under data/ is used.
 
     Parameters
     ----------
     max_confidence
-        Only assets with at most this confidence.
+        List only assets with at most this confidence.
     ids
         Print only the full ids, one on each line.
 
@@ -204,13 +205,13 @@ def report(
 
     The page is a single HTML file and needs no network. It has the assets by
     state with reasons, histograms, orientations, classes and properties, and a
-    table that shows each asset in 3D. Without STORE, it takes the one that
-    `make align` built last under data/.
+    table that shows each asset in 3D. Without STORE, the store that
+    `make align` built last under data/ is used.
 
     Parameters
     ----------
     out : FILE.html
-        The page. [default: beside the store]
+        File of the page. [default: beside the store]
     manifests
         Folder of the build's records. [default: beside the store, or manifests/build/NAME]
 
@@ -247,7 +248,7 @@ def report(
 
 
 _CATEGORIES = 20
-"""Most categories in a table; the files have all."""
+"""Largest number of categories in a printed table; the files have all."""
 
 
 @command()
@@ -263,9 +264,9 @@ def stats(
 ) -> None:
     """Show statistics of the voxels of STORE: classes and properties, by category and in total.
 
-    Both before the lookup (the annotated voxels of the PixieVerse fields) and after it
-    (the valid SLAT voxels). Without STORE, the one that `make align` built last under
-    data/ is taken.
+    Statistics are given before the lookup (for annotated voxels of the PixieVerse fields)
+    and after it (for valid SLAT voxels). Without STORE, the store that `make align` built
+    last under data/ is used.
 
     Parameters
     ----------
@@ -274,7 +275,7 @@ def stats(
     csv_file
         Also write a table to this file: a line for each group, side, property and scale.
     picture
-        Also draw them to this file.
+        Also draw the statistics to this file.
 
     Example
     -------

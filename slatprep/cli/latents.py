@@ -1,4 +1,4 @@
-"""`slatprep extract-slat` and `decode-slat`: TRELLIS's latents of images, Gaussians of latents."""
+"""`slatprep extract-slat` and `decode-slat`: make latents from images, Gaussians from latents."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ModelOptions:
     device: str | None = None
 
     def load(self, output: Output) -> Session:
-        """Load the model, and say on which device if none was asked for."""
+        """Load the model; print its device if --device was not given."""
         from slatprep.extract import load_session
 
         session = load_session(self.model, self.revision, self.device)
@@ -62,7 +62,7 @@ def extract_slat(
     """Turn IMAGES into structured latents with TRELLIS's image pipeline.
 
     Every image and seed gives <id>.npz, or <id>/<view>.npz if there are
-    views, in the form that build-store reads, and a JSON beside it with
+    views, in the format that build-store reads, and a JSON beside it with
     image, seed, model and revision. Existing files are kept, so that a stopped
     run can be continued. TRELLIS itself must be installed.
 
@@ -71,11 +71,11 @@ def extract_slat(
     out
         Folder of the latents, which build-store takes as --slat.
     seeds
-        Seed of the sampling; may be repeated, each seed gives a view.
+        Seed of the sampling; may be repeated: each seed gives a view.
     by_folder
         Images are named <id>/<view>, not <id>.
     no_preprocess
-        The background is removed already, and the images are cropped.
+        The images already have no background, and are cropped.
 
     Example
     -------
@@ -115,9 +115,9 @@ def decode_slat(
 ) -> None:
     """Decode the structured latents of SOURCE to Gaussians with TRELLIS's decoder.
 
-    SOURCE is a SLAT (npz or HDF5), a folder of them, or a store. Each asset
-    gives <id>.ply, as TRELLIS saves Gaussians, to which `slatprep transfer`
-    gives materials. TRELLIS itself must be installed.
+    SOURCE is a SLAT (npz or HDF5), a folder of SLATs, or a store. Each asset
+    gives <id>.ply, in the format of TRELLIS's Gaussians; `slatprep transfer`
+    gives them materials. TRELLIS itself must be installed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""`slatprep train` and `predict`: a decoder and its predictions."""
+"""`slatprep train` and `predict`: train a decoder, and predict with it."""
 
 from __future__ import annotations
 
@@ -28,35 +28,35 @@ if TYPE_CHECKING:
 _SIZES = ("small", "medium", "large")
 
 _PAPER: dict[str, Any] = {"steps": 2000, "accumulate": 4}
-"""What `--preset paper` sets; the other parameters of the paper are the defaults."""
+"""Parameters that `--preset paper` sets; the paper's other parameters are the defaults."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """What `TrainParameters` takes as it is given.
+    """Options that `TrainParameters` takes unchanged.
 
     Attributes
     ----------
     epochs
-        Passes over the training objects.
+        Number of passes over the training objects.
     steps
-        Steps of the optimiser, instead of --epochs; the last pass may be incomplete.
+        Number of optimiser steps, instead of --epochs; the last pass may be incomplete.
     batch_size
-        Assets in a batch.
+        Number of assets in a batch.
     accumulate
-        Batches per step of the optimiser.
+        Number of batches per optimiser step.
     learning_rate
         Initial learning rate of AdamW; a cosine schedule lowers it to 0.
     precision
         bf16: mixed precision; auto: bf16 if the processor has instructions for it, else fp32.
     keep
-        Weights of the epoch with the least validation loss, or of the last epoch.
+        Keep the weights of the epoch with the least validation loss, or of the last epoch.
     patience
         Stop after this number of epochs without a better validation loss.
     augmentation
         Symmetries to draw from: 8 that keep z up, or all 48 of the cube.
     max_ambiguity
-        Leave out assets that are more ambiguous.
+        Leave out assets whose ambiguity is larger.
     weigh_by_confidence
         Weight voxels by the probability that their class is right.
     seed
@@ -106,18 +106,18 @@ def train(
     out
         Folder of the run; a stopped run is resumed.
     size
-        0.20, 1.19 or 6.32 million weights.
+        Size of the decoder: 0.20, 1.19 or 6.32 million weights.
     all_sizes
-        Train all three, each in a folder of its own.
+        Train all three sizes, each in a folder of its own.
     preset
-        paper: 2,000 steps, and 4 accumulated batches a step, whose number the paper does not give.
-        Options that are given count more.
+        paper: 2,000 steps, and 4 accumulated batches per step (the paper does not give this
+        number). Other options override the preset.
     device
-        Where to compute.
+        Device that computes.
     workers
-        Processes that read ahead.
+        Number of processes that read ahead.
     threads
-        Threads to compute with. [default: all cores]
+        Number of threads that compute. [default: all cores]
 
     Example
     -------
@@ -241,7 +241,7 @@ def predict(
 ) -> None:
     """Predict material fields of SOURCE with a trained decoder.
 
-    SOURCE is a SLAT (npz or HDF5), a folder of them, a store, or an image,
+    SOURCE is a SLAT (npz or HDF5), a folder of SLATs, a store, or an image,
     whose latents TRELLIS samples if it is installed. Each asset gives
     <id>.npz with coords, properties in [-1,1] and properties_si in Pa,
     kg/m^3 and 1, material, probabilities of the eight classes, ranges, the
@@ -256,16 +256,16 @@ def predict(
     out
         Folder of the predictions; files of other assets are kept.
     gaussians : FILE.ply
-        Also decode an image's latents to Gaussians, and write those with their materials.
+        Also decode an image's latents to Gaussians, and write them with their materials.
     seed
         Seed of an image's latents.
     far
-        With --gaussians: give far Gaussians class 7 and properties 0, leave them out, or give them
-        the nearest material.
+        With --gaussians: give far Gaussians class 7 and properties 0, omit them, or give them the
+        nearest material.
     device
-        Where to compute. [default: cpu; for an image the GPU if there is one]
+        Device that computes. [default: cpu; for an image the GPU if there is one]
     batch_voxels
-        Number of voxels up to which assets are decoded together.
+        Decode assets together up to this number of voxels.
 
     Example
     -------
@@ -299,7 +299,7 @@ def predict(
     session, sampling = None, dict[str, float]()
     if is_image:
         source, session, sampling = _sample_latents(output, source, out, seed, device)
-        standardised = "no"  # TRELLIS samples them as its decoders take them.
+        standardised = "no"  # TRELLIS samples latents on the scale that its decoders take.
     read = LatentsReader(source, assets, space, standardised, output.note, output.problem)
     counts = {"predicted": 0, "voxels": 0}
     seconds = {**sampling, "read": 0.0, "decode": 0.0, "write": 0.0}
@@ -344,7 +344,7 @@ def predict(
 def _sample_latents(
     output: Output, source: Place, out: Path, seed: int, device: str
 ) -> tuple[Path, Session, dict[str, float]]:
-    """Sample the latents of an image; return their file, the pipeline, and time by stage."""
+    """Sample the latents of an image; return their file, the pipeline, and times by stage."""
     from slatprep import extract as work
 
     session = work.load_session(device=device)

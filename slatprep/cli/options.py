@@ -1,4 +1,4 @@
-"""The kinds of values that commands take, and the options that several commands share."""
+"""Define the types of values that commands take, and options that several commands share."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
     _Choice = click.Choice[str]
 else:
-    Place = Path  # Signatures are read without the records, which import numpy.
+    Place = Path  # Signatures need no records, which would import numpy.
     _Choice = click.Choice
 
 
 class FiniteRange(click.FloatRange):
-    """A range of finite numbers; NaN passes the comparisons of click's."""
+    """A range of finite numbers; click's own range accepts NaN."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -45,7 +45,7 @@ class FiniteRange(click.FloatRange):
 
 
 class Whole(click.IntRange):
-    """A range of whole numbers of at most 32 bits, which all that take one have room for."""
+    """A range of whole numbers of at most 32 bits, which fit every function that takes them."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         """Return the number; `click.BadParameter` if it is none of the range."""
@@ -56,12 +56,12 @@ class Whole(click.IntRange):
 
 
 class PlaceType(click.Path):
-    """A path, which click checks, or the URL of an object store, which is not checked here."""
+    """A path, which click checks, or the URL of an object store, which is not checked."""
 
     def convert(
         self, value: Any, parameter: click.Parameter | None, context: click.Context | None
     ) -> Any:
-        """Return a place."""
+        """Return the value as a place."""
         place = place_of(value)
         if str(place).startswith("memory://"):
             self.fail(
@@ -76,7 +76,7 @@ class ChoiceOf(_Choice):
     """A choice of words from a module, which is imported when the words are needed.
 
     ``package.module:NAME`` is an enum, a Literal, a mapping or a sequence of words; `others` are
-    more. ``slatprep --help`` imports every command, and must not import numpy with them.
+    added to them. ``slatprep --help`` imports every command, and must not import numpy.
     """
 
     def __init__(self, name: str, *others: str) -> None:
@@ -95,7 +95,7 @@ Positive = Annotated[int, Whole(min=1)]
 Above0 = Annotated[float, FiniteRange(min=0, min_open=True)]
 Count = Annotated[int, Whole(min=0)]
 Seed = Count
-"""NumPy takes no negative one."""
+"""A seed of NumPy's generators, which must not be negative."""
 File = Annotated[Path, click.Path(path_type=Path, exists=True, dir_okay=False)]
 Folder = Annotated[Path, click.Path(path_type=Path, exists=True, file_okay=False)]
 FileOrFolder = Annotated[Path, click.Path(path_type=Path, exists=True)]
@@ -107,9 +107,9 @@ RecordsFolder = Annotated[
     click.Path(path_type=Path, file_okay=False),
     "Folder for the records. [default: beside the store]",
 ]
-"""Of a build, which looks itself at what lies there."""
+"""Folder for a build's records; the build itself checks an existing folder."""
 PathOrUrl = Annotated[Place, PlaceType(path_type=Path)]
-"""Need not exist."""
+"""A path that need not exist, or a URL."""
 FileOrUrl = Annotated[Place, PlaceType(path_type=Path, exists=True)]
 """A file or folder that exists, or a URL."""
 FolderOrUrl = Annotated[Place, PlaceType(path_type=Path, exists=True, file_okay=False)]
@@ -117,14 +117,14 @@ FolderOrUrl = Annotated[Place, PlaceType(path_type=Path, exists=True, file_okay=
 
 
 def opened(store: Place) -> Store:
-    """Open a store; the module is imported here, since ``slatprep --help`` needs none of it."""
+    """Open a store; the import is local, because ``slatprep --help`` does not need it."""
     from slatprep.store import open_store
 
     return open_store(store)
 
 
 def chosen_store(store: Place | None) -> Place:
-    """Return the named store, or else the one that `make align` built last."""
+    """Return the named store, otherwise the store that `make align` built last."""
     if store is not None:
         return store
     built = (path for path in Path("data").glob("*.zarr") if path.is_dir())
@@ -137,7 +137,7 @@ def chosen_store(store: Place | None) -> Place:
 LastStore = Annotated[
     FolderOrUrl, Click(required=False, callback=lambda _context, _parameter, it: chosen_store(it))
 ]
-"""The store, by default the one built last."""
+"""A store; by default the one built last under data/."""
 
 StoreOption = Annotated[
     FolderOrUrl,
@@ -161,7 +161,7 @@ DrawnFile = Annotated[NewFile, Click(metavar="FILE.png|svg|pdf", callback=_drawa
 
 
 def draw_to(output: Output, picture: Path, draw: Callable[[str], bytes]) -> None:
-    """Write the picture that `draw` gives in the format that the file's name has."""
+    """Write the picture that `draw` returns for the format in the file's name."""
     with new_file(picture) as path:
         path.write_bytes(draw(picture.suffix[1:].lower()))
     output.note(f"picture: {picture}")
@@ -181,7 +181,7 @@ def complete_asset(
     from slatprep.store import open_store
     from slatprep.store.reader import is_store
 
-    # An option that still lacks its value leaves the arguments unparsed.
+    # If an option still lacks its value, the arguments are not parsed yet.
     for word in (*map(context.params.get, ("store", "named")), *context.args):
         if word is not None and is_store(Path(word)):
             return [known for known in open_store(word).ids if known.startswith(incomplete)]
@@ -198,7 +198,7 @@ AssetOption = Annotated[str, f"The asset, {_NAMED}.", _ASKED]
 
 
 def note_numbered(output: Output, store: Store, names: Iterable[str]) -> None:
-    """Print which assets are taken by their numbers, as a number may be meant to begin an id."""
+    """Print which assets are chosen by number, because a number may be meant as an id prefix."""
     for name in names:
         if not (taken := store.ids[store.match(name)]).startswith(name):
             output.note(f"--asset {name}: no id begins so; row {name} is taken, {taken}")
@@ -216,19 +216,19 @@ UsableVerdicts = Annotated[
     "Only assets with this verdict; may be repeated. [default: good and doubtful]",
     Click("--verdict", multiple=True, callback=lambda _context, _parameter, it: it or None),
 ]
-"""None if the option was not given."""
+"""Verdicts to take; None if the option was not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenOptions:
-    """Which assets of a store are wanted.
+    """Verdicts and categories that choose assets of a store.
 
     Attributes
     ----------
     verdicts
-        Only assets with this verdict; may be repeated.
+        Take only assets with this verdict; may be repeated.
     categories
-        Only assets of this category; may be repeated.
+        Take only assets of this category; may be repeated.
     """
 
     verdicts: Annotated[
@@ -244,7 +244,7 @@ def note_left_out(
     kept: Collection[str] = (),
     why: str = "--verdict all takes them",
 ) -> list[str]:
-    """Print how many of the assets have no verdict that is kept; return the line, if any has."""
+    """Print how many assets have a verdict that is not in `kept`; return the line, if any."""
     verdicts = store.column("verdict")
     left = tally(one for row in rows if (one := verdicts[row]) not in kept)
     lines = [f"left out: {left} ({why})"] if left else []
@@ -270,12 +270,13 @@ Jobs = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class WorkersOptions:
-    """Where a command computes: in processes of this machine, or on a cluster.
+    """Processes of this machine, or a cluster, on which a command computes.
 
     Attributes
     ----------
     scheduler : ADDRESS
-        Compute on the Dask cluster of this scheduler, as tcp://host:8786, instead of here.
+        Compute on the Dask cluster of this scheduler (such as tcp://host:8786), not on this
+        machine.
     """
 
     jobs: Jobs = 1
@@ -291,7 +292,7 @@ class WorkersOptions:
 
     @contextmanager
     def started(self, output: Output) -> Iterator[int | Workers]:
-        """Give what `slatprep.workers` takes as `jobs`."""
+        """Yield the argument `jobs` of `slatprep.workers`."""
         if self.scheduler is None:
             yield self.jobs
             return
@@ -303,17 +304,17 @@ class WorkersOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitOptions:
-    """How objects are split.
+    """Rule by which objects are split into train, val and test.
 
     Attributes
     ----------
     split_by : hash|pixie|category:NAME|FILE
-        How objects are split: by a hash of their ids, by Pixie's rule, one category for testing, or
-        by a file of ids. A file has a list for testing, or a JSON object with the lists train, val
-        and test. [default: hash]
+        Split objects by a hash of their ids, by Pixie's rule, with one category for testing, or by
+        a file of ids. A file has a list for testing, or a JSON object with the lists train, val and
+        test. [default: hash]
     shares : TRAIN,VAL,TEST
-        Shares of the split by hash, which also divides objects that another rule does not test on
-        into train and val. [default: 0.8,0.1,0.1]
+        Shares of the split by hash. With another rule, they divide the objects that are not for
+        testing into train and val. [default: 0.8,0.1,0.1]
     """
 
     split_by: str | None = None
@@ -321,7 +322,7 @@ class SplitOptions:
 
     @property
     def given(self) -> bool:
-        """Whether the command line says how to split."""
+        """Whether the command line has an option of the split."""
         return self.split_by is not None or self.shares is not None
 
     @property
@@ -337,22 +338,22 @@ class SplitOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class StatedOptions:
-    """What a store cannot know of itself as a dataset.
+    """Facts about a dataset that its store does not contain.
 
     Attributes
     ----------
     name
         Name of the dataset. [default: the store's]
     license : SPDX|URL
-        Its licence, such as CC-BY-4.0.
+        Licence of the dataset, such as CC-BY-4.0.
     url
-        Its home page.
+        Home page of the dataset.
     cite_as : TEXT
-        How to cite it.
+        Citation of the dataset.
     version : X.Y.Z
-        Its version.
+        Version of the dataset.
     date_published : YYYY-MM-DD
-        When it was published.
+        Date of its publication.
     """
 
     name: str = ""
@@ -365,7 +366,7 @@ class StatedOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """What decides the parameters of a build.
+    """Options that decide the parameters of a build.
 
     Attributes
     ----------
@@ -376,16 +377,16 @@ class SourceOptions:
     slat
         Root of the TRELLIS latents, or one HDF5 file, or a URL.
     samples
-        Where an object has several annotations: refuse it, take the first, make an asset of each,
-        or merge their labels in one asset. [default: one]
+        If an object has several annotations: refuse it, take the first, make an asset of each, or
+        merge their labels in one asset. [default: one]
     encoder : NAME|FILE.json
         The encoder of the latents. [default: trellis]
     map
         CSV that joins the ids of the two sides, or TRELLIS's metadata.csv.
     ranges : dataset|pLO-pHI|pixie|FILE
-        Where the normalisation ranges come from; p1-p99: percentiles. [default: dataset]
+        Source of the normalisation ranges; p1-p99: percentiles. [default: dataset]
     ranges_of
-        Objects that ranges of the dataset are computed from. [default: all]
+        Objects from which ranges of the dataset are computed. [default: all]
     preset
         Named parameters; 'paper' is the protocol of SLAT-Phys, in Pixie's ranges.
     """
@@ -402,7 +403,7 @@ class SourceOptions:
     preset: Annotated[str | None, ChoiceOf("slatprep.parameters:PRESETS")] = None
 
     def parameters(self, **passes: bool) -> BuildParameters:
-        """Return the parameters of a build; `passes` are ``consensus`` and ``witness``."""
+        """Return the parameters of a build; `passes` switch on ``consensus`` and ``witness``."""
         from slatprep.parameters.files import OPTIONS, load_parameters
 
         options = vars(self) | vars(self.splits)
@@ -423,13 +424,13 @@ class SourceOptions:
 
 
 _FEW_OBJECTS = 100
-"""Below this number a hash's shares are far from those asked for."""
+"""Number of objects below which the shares of a split by hash are far from the given ones."""
 
 
 def split_of_objects(
     output: Output, store: Store, rule: Mapping[str, Any], how: str
 ) -> dict[str, Split]:
-    """Return the split of each object; print the sizes of splits, and ids that are in none."""
+    """Return the split of each object; print the sizes of splits, and ids without a split."""
     from slatprep.learn.splits import assign_store
 
     assignment = assign_store(store, **rule)

@@ -1,8 +1,8 @@
-"""Printing for all commands: tables, notes, JSON and a progress bar.
+"""Print for all commands: tables, notes, JSON and a progress bar.
 
-Results go to standard output, everything else to standard error. On a terminal
+Results go to standard output, everything else to standard error. On a terminal,
 tables are drawn with rich, which respects NO_COLOR; in a pipe they are plain
-aligned columns; with ``--json`` standard output is one JSON document.
+aligned columns. With ``--json``, standard output is one JSON document.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ EXIT_CODES = {
     EXIT_UNPRINTED: "the work is done, but its result could not be printed",
     EXIT_INTERRUPTED: "stopped with Ctrl-C or SIGTERM; a store is the old or the new one",
 }
-"""What the exit code of every command says."""
+"""Meaning of each exit code, for every command."""
 
 Cell = str | int | float | bool | None
 
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
 
 _MAY_SHRINK = ("category", "group", "model", "why", "A", "B")
-"""Columns whose texts are cut, or wrapped between words, on a narrow terminal."""
+"""Columns whose texts are cut or wrapped between words on a narrow terminal."""
 _LEAST_WIDTH, _GAP = 12, 2
 _LEAST_ID = 8
 _LISTED = 10
 _SECONDS_BETWEEN_LINES = 30.0
 _LEAST_DONE = 2
-"""Fewest assets done for an estimate of the time left."""
+"""Smallest number of finished assets for an estimate of the time left."""
 
 
 class Output:
-    """Prints the results of one command in the form that was asked for.
+    """Printer of one command's results, as tables or JSON.
 
-    With `as_json`, that is one JSON document on standard output instead of tables. `verbosity` -1
-    prints only errors and results, 1 prints more details. `if_stopped` is printed if the command is
-    stopped: what is kept, how to go on.
+    With `as_json`, standard output is one JSON document instead of tables. `verbosity` -1 prints
+    only errors and results, 1 prints more details. If the command is stopped, `if_stopped` is
+    printed: what is kept, and how to go on.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
@@ -65,11 +65,10 @@ class Output:
         self.if_stopped = ""
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
-        """Print a result: the document as JSON, or else what `show` prints.
+        """Print a result: the document as JSON, otherwise by `show`.
 
-        The document is a mapping or a dataclass; command, version and ``ok``, whether the result
-        is `complete`, are put before its entries. If it is not complete, exit with
-        `EXIT_INCOMPLETE`.
+        The document is a mapping or a dataclass. Its entries follow the command, the version and
+        ``ok``, which says whether the result is `complete`. If not, exit with `EXIT_INCOMPLETE`.
         """
         if self.as_json:
             self._say_document(complete, vars(document) if is_dataclass(document) else document)
@@ -83,7 +82,7 @@ class Output:
 
     @contextmanager
     def failing(self) -> Iterator[None]:
-        """Print an error that ends the command as JSON too, with ``--json``."""
+        """With ``--json``, print an error that ends the command as JSON too."""
         try:
             yield
         except (SlatprepError, click.UsageError) as error:
@@ -93,13 +92,13 @@ class Output:
             raise
 
     def made(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
-        """Print a summary of what was written, as `result` does; if quiet, only as JSON."""
+        """Print a summary of written files like `result`; if quiet, only as JSON."""
         self.result(document, show if self.verbosity >= 0 else lambda: None, complete)
 
     def counted(
         self, title: str, counts: Mapping[str, Cell], *, complete: bool = True, **more: object
     ) -> None:
-        """Print counts of what was written as a table of one row; JSON has `more` beside them."""
+        """Print counts of written items as a table of one row; JSON also has the entries `more`."""
         self.made({**more, **counts}, lambda: self.record(title, counts), complete)
 
     def note(self, message: str) -> None:
@@ -108,11 +107,11 @@ class Output:
             say(message, err=True)
 
     def problem(self, message: str) -> None:
-        """Print a line on standard error about something that failed."""
+        """Print a line about a failure on standard error."""
         say(message, err=True)
 
     def problems(self, messages: Sequence[str], where: str) -> None:
-        """Print the first lines about what failed, and where the others are, if there are more."""
+        """Print the first lines about failures, and `where` to find the rest, if there are more."""
         for message in messages[:_LISTED]:
             self.problem(message)
         if len(messages) > _LISTED:
@@ -128,7 +127,7 @@ class Output:
         draw(title, columns, [[_text(cell) for cell in row] for row in rows], numeric)
 
     def id_length(self, ids: Iterable[str]) -> int | None:
-        """Return the length of unique prefixes of ids on a terminal, else None for whole ids."""
+        """Return the length of unique id prefixes if on a terminal, else None for whole ids."""
         if not sys.stdout.isatty():
             return None
         length, ids = _LEAST_ID, sorted(set(ids))
@@ -138,16 +137,16 @@ class Output:
         return length
 
     def record(self, title: str, cells: Mapping[str, Cell]) -> None:
-        """Print a table of one row, whose cells are given by column."""
+        """Print a table of one row, given as a mapping of columns to cells."""
         self.table(title, tuple(cells), [tuple(cells.values())])
 
     @contextmanager
     def progress(self, label: str, unit: str = "assets") -> Iterator[Progress]:
         """Show progress and the estimated time left on standard error.
 
-        The estimate is the mean over all assets done, from two on. An update with none done
-        restarts the clock. If standard error is not a terminal, a line is printed every half
-        minute instead of a bar.
+        The estimate uses the mean time over all finished assets, once there are two. An update
+        with 0 done restarts the clock. If standard error is not a terminal, a line is printed
+        every half minute instead of a bar.
         """
         if self.verbosity < 0:
             yield lambda done, total: None
@@ -160,7 +159,7 @@ class Output:
 
 @contextmanager
 def new_file(file: Path) -> Iterator[Path]:
-    """Yield a path whose content becomes that of `file`; StoreError where it cannot be written."""
+    """Yield a temporary path that then replaces `file`; raise StoreError if it is not writable."""
     from slatprep.storage.atomic import staged, writing
 
     with writing(str(file), file.parent), staged(file) as path:
@@ -168,7 +167,7 @@ def new_file(file: Path) -> Iterator[Path]:
 
 
 def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table as CSV in which no text becomes a formula in a spreadsheet."""
+    """Write a table as CSV whose texts cannot become formulas in a spreadsheet."""
     import csv
 
     with new_file(file) as path, path.open("w", encoding="utf-8", newline="") as opened:
@@ -178,13 +177,13 @@ def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]
 def _for_spreadsheet(value: object) -> object:
     if not isinstance(value, str):
         return value
-    # A table is printed on terminals as well.
+    # Users may also print the file on a terminal.
     text = printable(value)
     return f"'{text}" if text.lstrip()[:1] in ("=", "+", "-", "@") else text
 
 
 def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
-    """Print text through `printable`; all commands print with this function."""
+    """Print text through `printable`; all commands use this function."""
     emit(printable(str(text)), err=err, nl=nl)
 
 
@@ -193,15 +192,15 @@ OUTPUT_OPTIONS = (
     click.Option(["-q", "--quiet"], is_flag=True, help="Print only errors and results."),
     click.Option(["-v", "--verbose"], is_flag=True, help="Print more details."),
 )
-"""The options of every command, which a command's runner reads."""
+"""Options of every command; the command's runner reads them."""
 
 
 class PrintingCommand(click.Command):
-    """A command with `OUTPUT_OPTIONS`, which prints wrong use as JSON too, with ``--json``."""
+    """A command with `OUTPUT_OPTIONS`; with ``--json`` it also prints wrong use as JSON."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments, as click does."""
-        # Asked before, since click takes parsed words out of the list.
+        # This precedes parsing, because click removes parsed words from the list.
         as_json = "--json" in args and not ctx.resilient_parsing
         with Output(as_json, 0, ctx.command_path.partition(" ")[2]).failing():
             try:
@@ -213,7 +212,7 @@ class PrintingCommand(click.Command):
 
 
 def _in_words(error: click.BadParameter) -> str:
-    """Return why a word is no number, of which click says "integer range"; else nothing."""
+    """Return why a word is not a number, in plainer words than click's; empty if it is one."""
     kind = error.param and error.param.type
     value, wrong, _ = error.message.partition(" is not a ")
     if not wrong or not isinstance(kind, click.IntRange | click.FloatRange):
@@ -229,7 +228,7 @@ def local_path(value: Any) -> Any:
     if is_place(value) and str(value) != in_unicode(str(value)):
         raise click.UsageError(f"{in_unicode(str(value))}: expected a path in UTF-8")
     if not isinstance(value, Path):
-        return value  # Options that may be a URL are converted by their type.
+        return value  # The types of options that may be a URL convert it themselves.
     place = place_of(value)
     if storage_of(place).local is None:
         raise click.UsageError(f"{place}: expected a path of the local disk")
@@ -251,7 +250,7 @@ def _jsonable(value: object) -> object:
 
 
 def _is_number(cell: Cell) -> bool:
-    """Whether a cell may stand in a column of numbers."""
+    """Return whether a cell may be in a column of numbers."""
     return cell is None or (isinstance(cell, int | float) and not isinstance(cell, bool))
 
 
@@ -267,7 +266,7 @@ def _text(cell: Cell) -> str:
         if 0 < size < 5e-4:
             return f"{cell:.1e}"
         return f"{cell:.3f}" if size < 1e4 else f"{cell:,.0f}" if size < 1e7 else f"{cell:.3g}"
-    # A cell is one line.
+    # A cell must be a single line.
     return printable(str(cell)).replace("\n", "\\n")
 
 
@@ -282,7 +281,7 @@ def _rich_table(
     table = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, show_edge=False)
     needed = 0
     for k, (column, right) in enumerate(zip(columns, numeric, strict=True)):
-        heading = column.replace("_", "_\n")  # The name of a figure may be wider than its numbers.
+        heading = column.replace("_", "_\n")  # A figure's name may be wider than its numbers.
         widest = max(map(len, [*heading.split("\n"), *(row[k] for row in cells)]))
         fits = column not in _MAY_SHRINK
         least = widest if fits else min(widest, _LEAST_WIDTH)
@@ -342,7 +341,7 @@ def _progress_bar(label: str) -> Iterator[Progress]:
     from rich.text import Text
 
     class Numbers(rich.ProgressColumn):
-        """Number done, time taken, and the estimated time left."""
+        """Column with the number done, the time taken, and the estimated time left."""
 
         def render(self, task: rich.Task) -> Text:
             if task.total is None:

@@ -1,4 +1,4 @@
-"""`slatprep transfer` and `simulate`: materials of particles, and their motion."""
+"""`slatprep transfer` and `simulate`: give particles materials, and move them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialOptions:
-    """Where materials come from: an asset of a store, or a prediction.
+    """Source of materials: an asset of a store, or a prediction.
 
     Attributes
     ----------
     prediction : FILE.npz
-        Predicted materials instead of an asset: coords, material, and properties (normalised as
-        --store or --ranges says) or properties_si.
+        Predicted materials instead of an asset: coords, material, and properties (normalised with
+        the ranges of --store or --ranges) or properties_si.
     ranges : pixie|FILE
         Ranges of a prediction's properties.
     """
@@ -39,7 +39,7 @@ class MaterialOptions:
     ranges: str | None = None
 
     def field(self, output: Output, points: Points) -> VoxelField:
-        """Return the materials of a stored asset or of a prediction, one of which is given."""
+        """Return the materials of the stored asset or of the prediction that is given."""
         from slatprep.normalize import PIXIE_RANGES
         from slatprep.particles.fields import predicted_field, stored_field
         from slatprep.readers.ranges import read_ranges
@@ -81,28 +81,27 @@ def transfer(
 ) -> None:
     """Give each particle of PARTICLES the material of the nearest voxel.
 
-    PARTICLES is a PLY of Gaussians as TRELLIS saves it, any other PLY with
+    PARTICLES is a PLY of Gaussians in TRELLIS's format, any other PLY with
     x, y and z, or an npy or npz of positions. The result is a PLY with the
-    fields of Pixie's material fields, in SI units, for PhysGaussian.
+    columns of Pixie's material fields, in SI units, for PhysGaussian.
 
     Parameters
     ----------
     out : FILE.ply
-        Where to write the particles with their materials.
+        File to write, with the particles and their materials.
     points
-        Take an asset's materials from its SLAT voxels, a surface, or from its PixieVerse field, a
-        solid.
+        Take an asset's materials from its SLAT voxels (a surface) or from its PixieVerse field (a
+        solid).
     axes
         Axes of the particles: those of TRELLIS's Gaussians, of its meshes, or of the SLAT frame.
-        [default: as a PLY of slatprep states; for Gaussians of TRELLIS and SAM 3D those that fit;
-        else slat]
+        [default: as a PLY of slatprep states; for Gaussians of TRELLIS and SAM 3D the axes that
+        fit; else slat]
     frame
         Write positions as in the particles' file, or in the SLAT frame.
     max_distance : VOXELS
-        Distance to the nearest voxel above which a particle is far.
+        Largest distance to the nearest voxel; particles beyond it are far.
     far
-        Give far particles class 7 and properties 0, leave them out, or give them the nearest
-        material.
+        Give far particles class 7 and properties 0, omit them, or give them the nearest material.
 
     Example
     -------
@@ -143,7 +142,7 @@ def transfer(
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions:
-    """What moves the object, for how long, and how finely that is computed.
+    """Forces on the object, and the length and resolution of its motion.
 
     Attributes
     ----------
@@ -152,16 +151,16 @@ class MotionOptions:
     height : METRES
         Height of the fall.
     wind : M/S
-        Wind along x. The object then stands, held at its foot and where it is stationary or sand,
-        without gravity.
+        Wind along x. The object then stands without gravity, held at its foot and in parts that are
+        stationary or sand.
     seconds
         Length of the motion.
     rate
-        Frames a second.
+        Frames per second.
     substeps
-        Time steps a frame.
+        Time steps per frame.
     device
-        Where to compute: cpu, cuda:0. [default: the GPU if there is one]
+        Device that computes: cpu, cuda:0. [default: the GPU if there is one]
     """
 
     size: options.Above0 = 0.4
@@ -189,17 +188,17 @@ def simulate(
     particles: Annotated[int, click.IntRange(min=4, max=256)] = 32,
     motion: MotionOptions,
 ) -> None:
-    """Simulate an object of a store, or a predicted one, and move its Gaussians.
+    """Simulate an object of a store or of a prediction, and move its Gaussians.
 
     Particles fill the object and take the materials of its voxels; Newton's
-    material point method moves them on a CPU or a GPU. Gaussians are carried by
-    the particles around them: positions and rotations follow, all other
-    attributes stay. Needs Newton: pip install 'slatprep[simulate]'.
+    material point method moves them on a CPU or a GPU. Gaussians move with the
+    particles around them: positions and rotations change, all other attributes
+    stay. Needs Newton: pip install 'slatprep[simulate]'.
 
     Parameters
     ----------
     gaussians : FILE.ply
-        PLY of Gaussians of the object, as TRELLIS, SAM 3D Objects or PhysGaussian save them.
+        PLY of the object's Gaussians, in the format of TRELLIS, SAM 3D Objects or PhysGaussian.
         [default: a Gaussian for each particle, in the colour of its class]
     material
         Take this class for the whole object.
@@ -212,11 +211,11 @@ def simulate(
     picture : FILE
         Also draw the frames: an animation (gif, webp) or a strip of five (png).
     axes
-        Axes of the Gaussians. [default: those that fit]
+        Axes of the Gaussians. [default: the axes that fit]
     stretch
         Let the scales of Gaussians follow the deformation too.
     particles
-        Particles along each axis of the cube.
+        Number of particles along each axis of the cube.
 
     Example
     -------

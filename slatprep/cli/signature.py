@@ -1,13 +1,14 @@
-"""Commands made of functions: a signature declares each argument and option once.
+"""Make commands from functions, whose signatures declare each argument and option once.
 
-A parameter that may be given by position is an argument of the command, a keyword-only one an
-option. Its help, and after a colon its metavar, are its entry under ``Parameters`` in the
-docstring. Its annotation ``Annotated[type, ...]`` holds what else the command line needs to know: a
-`click.ParamType` where the type alone does not say what is allowed, and a `Click` with any other
-setting; a type that several commands share has its help there, as a string. A parameter without a
-default is required, a ``bool`` is a flag, a ``tuple[X, ...]`` may be repeated, a ``Literal`` is a
-choice. A dataclass is a group of options, which several commands may share, with their help under
-``Attributes``.
+A positional parameter is an argument of the command; a keyword-only parameter is an option. Its
+entry under ``Parameters`` in the docstring is its help, with its metavar after a colon. An
+annotation ``Annotated[type, ...]`` can add a `click.ParamType`, if the type alone does not define
+the allowed values, and a `Click` with other settings. A type that several commands share has its
+help in the annotation, as a string.
+
+A parameter without a default is required, a ``bool`` is a flag, a ``tuple[X, ...]`` may be
+repeated, a ``Literal`` is a choice. A dataclass is a group of options, which several commands may
+share; its ``Attributes`` section has their help.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _PLAIN = (int, float, str)
 
 
 class Click:
-    """What click takes besides type, default and help; `flag` where it is not the name's."""
+    """Settings of click besides type, default and help; `flag` if it differs from the name."""
 
     def __init__(self, flag: str | None = None, **settings: Any) -> None:
         self.flag = flag
@@ -45,7 +46,7 @@ class Click:
 
 
 def command(name: str | None = None, **settings: Any) -> Callable[[_Function], click.Command]:
-    """Make a command of a function; its docstring is the help.
+    """Make a command from a function, whose docstring is the help.
 
     Other sections of the docstring, such as ``Example``, are printed below the options. The
     function gets an `Output` as its first argument.
@@ -73,16 +74,16 @@ def _taken_from_docstring(documented: Any) -> tuple[str, dict[str, str]]:
 
 
 def _entries(section: str) -> dict[str, tuple[str, str]]:
-    """Return the metavar and the help of each name that a section describes."""
+    """Return the metavar and the help of each name in a section."""
     return {name: (metavar, text) for name, metavar, text in _ENTRY.findall(section)}
 
 
 def _runner(function: _Function) -> Callable[..., object]:
-    """Return what click calls: it hands the function its `Output` and groups of options."""
+    """Return the function that click calls, which adds the `Output` and groups of options."""
 
     @functools.wraps(function)
     def run(*, as_json: bool, quiet: bool, verbose: bool, **options: Any) -> object:
-        # Without the program: "info".
+        # The name has no program before it: "info", not "slatprep info".
         context = click.get_current_context()
         name = context.command_path.partition(" ")[2] or context.info_name or ""
         output = Output(as_json, int(verbose) - int(quiet), name)
@@ -101,7 +102,7 @@ def _hints(declaring: Any) -> dict[str, Any]:
 
 
 def _group(hints: dict[str, Any], given: dict[str, Any]) -> None:
-    """Replace values that belong to groups by the groups."""
+    """Replace the values of each group in `given` by an instance of the group."""
     for name, hint in hints.items():
         if dataclasses.is_dataclass(hint):
             _group(_hints(hint), given)
@@ -165,7 +166,7 @@ def _declared(
 
 
 def _taken_apart(hint: Any) -> tuple[Any, bool, tuple[Any, ...]]:
-    """Return an annotation's type, whether it may be repeated, and what `Annotated` adds."""
+    """Return an annotation's type, whether it may be repeated, and the extras of `Annotated`."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         kind, repeated, told = _taken_apart(arguments[0])
@@ -180,15 +181,15 @@ def _taken_apart(hint: Any) -> tuple[Any, bool, tuple[Any, ...]]:
 
 
 class NewPath(click.Path):
-    """A path of the local disk that a command writes, which `require_apart` looks at."""
+    """A path of the local disk that a command writes; `require_apart` checks it."""
 
 
 def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
-    """Refuse a file or folder to write that is part of a store or of what a command reads.
+    """Refuse to write a file or folder that is part of a store or of a command's inputs.
 
     A command writes the parameters of the type `NewPath`; `given` are all values by name. A new
-    file or folder below a folder that is read may be written. So may a folder below that of a run,
-    which holds predictions.
+    file or folder may lie below an input folder. An existing folder may lie below the folder of a
+    run (``checkpoint``), because it holds predictions.
     """
     written = {
         parameter.name: (parameter, Path(given[parameter.name]))
@@ -218,15 +219,15 @@ def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
 
 
 def _inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
-    """Yield files and folders among options, by name, and the records of stores."""
+    """Yield option name and path of each input file and folder, and of the records of stores."""
     from slatprep.store.reader import is_store
     from slatprep.store.records import manifests_of
 
     for name, value in given.items():
         for one in value if isinstance(value, tuple) else (value,):
             if isinstance(one, str):
-                # A word, or a file, of ranges or of ids. Folders of grids, [NAME=]DIR, are not
-                # looked at: a word like "train" may be the name of a folder that it does not mean.
+                # The value may be a word, or a file of ranges or ids. Folders of grids,
+                # [NAME=]DIR, are ignored, because a word like "train" may also name a folder.
                 path = one.rpartition("=")[2]
                 if os.path.isfile(path):  # noqa: PTH113 - a word too long for a name is no error
                     yield name, Path(path)

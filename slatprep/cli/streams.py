@@ -1,4 +1,4 @@
-"""Standard output and standard error, where either may be closed, or full."""
+"""Print to standard output and standard error, even if one is closed or its disk is full."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ import click
 _NAMES = {1: "standard output", 2: "standard error"}
 
 _broken: dict[int, str] = {}
-"""Why a stream cannot be written to, by its file descriptor."""
+"""Reason why a stream cannot be written to, by its file descriptor."""
 
 _untold: set[int] = set()
-"""The streams among them that something was to be printed on."""
+"""File descriptors of broken streams that lost a text."""
 
 
 class OutputLostError(Exception):
-    """Standard output does not take what a command prints."""
+    """A command's result could not be printed on standard output."""
 
 
 def prepare_streams() -> None:
-    """Open what is closed of the standard streams as the null device.
+    """Open closed standard streams as the null device.
 
-    A file that a command opens would else get the number of a closed stream, and what a library
-    prints would go into that file.
+    Otherwise a file that a command opens could get the descriptor of a closed stream, and texts
+    that libraries print would go into this file.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError as error:
-            os.open(os.devnull, os.O_RDWR)  # It takes the lowest number that is free.
+            os.open(os.devnull, os.O_RDWR)  # Takes the lowest free number, which is this one.
             if number in _NAMES:
                 _broken[number] = error.strerror or "closed"
-    # Python has no stream for what was closed when it started.
+    # Python has no stream object for a descriptor that was closed when it started.
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
     if sys.stderr is None:
@@ -42,10 +42,10 @@ def prepare_streams() -> None:
 
 
 def emit(text: str, *, err: bool, nl: bool) -> None:
-    """Print a text; OutputLostError where standard output does not take it.
+    """Print a text; raise OutputLostError if standard output cannot be written to.
 
-    What follows after a reader has closed its pipe is dropped, and the command goes on. That
-    standard error does not take a text is told when the command ends, by `lost`.
+    After a reader has closed its pipe, further texts are dropped and the command goes on. If
+    standard error cannot be written to, `lost` reports this when the command ends.
     """
     number = 2 if err else 1
     if number not in _broken:
@@ -53,10 +53,10 @@ def emit(text: str, *, err: bool, nl: bool) -> None:
             click.echo(text, err=err, nl=nl)
             return
         except OSError as error:
-            # What is still in the buffer must not fail again when Python ends.
+            # The text still in the buffer must not fail again when Python ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
             if error.errno == errno.EPIPE:
-                return  # Whoever reads has read enough, as `head` does.
+                return  # The reader, such as `head`, has read enough.
             _broken[number] = error.strerror or str(error)
     _untold.add(number)
     if not err:
@@ -64,7 +64,7 @@ def emit(text: str, *, err: bool, nl: bool) -> None:
 
 
 def lost() -> str:
-    """Return which stream did not take what was printed and why, or an empty text."""
+    """Return which streams lost a text and why; empty if none did."""
     return "; ".join(
         f"{_NAMES[number]} cannot be written to ({_broken[number]})" for number in sorted(_untold)
     )

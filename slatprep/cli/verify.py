@@ -1,4 +1,4 @@
-"""`slatprep verify` and `diff`: whether a store is whole, and what two differ in."""
+"""`slatprep verify` and `diff`: check whether a store is whole, and compare two stores."""
 
 from __future__ import annotations
 
@@ -34,23 +34,24 @@ def verify(
     Compares metadata with the contract, files with their digests, and chunks with
     their checksums. Compares values with their ranges, annotations with the
     stored grid and transform, and records with their schema and the rows. Every
-    fault is named, and the exit code is then 1.
+    fault is printed; with any fault, the exit code is 1.
 
     Parameters
     ----------
     manifests
         Folder of the records. [default: beside the store, or manifests/build/NAME]
     sources
-        Compare the source files with the records, too.
+        Also compare the source files with the records.
     pixieverse
-        Root of the PixieVerse files now. [default: as at the build]
+        Present root of the PixieVerse files. [default: as at the build]
     slat
-        Folder of the latents, or of their one HDF5 file, now. [default: as at the build]
+        Present folder of the latents, or of their one HDF5 file. [default: as at the build]
     also
-        With both: root of a further source now; once for each, in the order of [[also]].
+        With --pixieverse and --slat: present root of a further source; once for each, in the order
+        of [[also]].
     sample : N
-        Compare values, records and sources of N assets, evenly chosen, not of all. Files and the
-        columns of all assets are compared whole nevertheless.
+        Compare values, records and sources of only N assets, evenly chosen. Files and the columns
+        of all assets are still compared whole.
 
     Example
     -------
@@ -93,10 +94,10 @@ def verify(
 
 _SHOWN = 20
 _NAMED = 3
-"""Most columns that are named in a line; --json names all."""
+"""Largest number of columns named in a line; --json names all."""
 
 _VALUE = 20
-"""Characters of a setting: enough for a number or the beginning of a digest."""
+"""Number of characters of a setting: enough for a number or the start of a digest."""
 
 
 @command()
@@ -112,13 +113,13 @@ def diff(
 
     Lists assets in only one of the stores; changed sources, verdicts, placements, labels,
     properties in SI units and latents of assets in both; and different ranges, parameters
-    and versions. The exit code is 1 where the stores differ.
+    and versions. The exit code is 1 if the stores differ.
 
     Parameters
     ----------
     worst : N
-        Number of changed assets to list, those with most changed labels first. [default: 20; with
-        --json all]
+        Number of changed assets to list, with most changed labels first. [default: 20; with --json
+        all]
 
     Example
     -------
@@ -131,7 +132,7 @@ def diff(
         worst = _SHOWN
     with output.progress("diff") as progress:
         found = compare_stores(a, b, worst=worst, jobs=jobs, progress=progress)
-    found = replace(found, a=a, b=b)  # As they were typed.
+    found = replace(found, a=a, b=b)  # Print the places as they were typed.
     output.result(found, lambda: _show_difference(output, found), complete=found.same)
 
 
@@ -182,7 +183,7 @@ def _show_difference(output: Output, found: StoreDifference) -> None:
 
 
 def _how(found: StoreDifference, what: str) -> str:
-    """Return the extent of a kind of change over all assets, where it has one."""
+    """Return the extent of a kind of change over all assets, or an empty text."""
     if what == "verdict":
         return ", ".join(f"{count:,} {words}" for words, count in found.verdicts.items())
     if what == "placement":
