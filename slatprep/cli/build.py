@@ -282,6 +282,8 @@ def _show_damaged(output: Output, damaged: Sequence[str]) -> None:
 def _show_plan(output: Output, plan: BuildPlan) -> None:
     """Print what would be done with each asset, and why; unchanged assets are only counted."""
     _show_damaged(output, plan.damaged)
+    for warning in plan.warnings:
+        output.problem(warning)
     keys = ("asset_id", "action", "reason")
     assets = [{key: getattr(asset, key) for key in keys} for asset in plan.assets]
 
@@ -290,12 +292,23 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
         if shown:
             rows = (tuple(one.values()) for one in shown)
             output.table("What would be done", ("asset", "action", "why"), rows)
-        counts = ", ".join(f"{count:,} to {action}" for action, count in plan.actions.items())
-        say(f"assets:  {len(plan.assets):,} ({counts})")
+        say(_counts(plan.statuses, plan.actions["align"]))
         _say_removed(len(plan.taken_out), plan.taken_out, "is")
         say(f"store:   {plan.store} (a dry run: nothing is written)")
 
-    output.result(vars(plan) | {"actions": plan.actions, "assets": assets}, show)
+    counts = {"actions": plan.actions, "statuses": plan.statuses, "removed": len(plan.taken_out)}
+    complete = plan.statuses["ok"] == sum(plan.statuses.values())
+    output.result(vars(plan) | counts | {"assets": assets}, show, complete)
+
+
+def _counts(statuses: Mapping[str, int], aligned: int, failed: str = "not built") -> str:
+    """Return the line that counts assets; those that went in were aligned or taken over."""
+    # Beside the verdicts, "failed" would read as a verdict, and "ok" as all other verdicts.
+    taken_over = statuses["ok"] - aligned
+    counts = {"aligned": aligned} | ({"taken over": taken_over} if taken_over else {})
+    counts |= {failed: statuses["failed"], "skipped": statuses["skipped"]}
+    told = ", ".join(f"{count:,} {word}" for word, count in counts.items())
+    return f"assets:  {sum(counts.values()):,} ({told})"
 
 
 def _say_removed(count: int, taken_out: Mapping[str, str], there: str) -> None:
@@ -346,13 +359,14 @@ def report(output: Output, summary: BuildSummary) -> None:
                 names = ("asset_id", "verdict", "confidence", "fitness")
                 rows = map(attrgetter(*names), list_assets(store))
                 output.table("Assets", ("asset", *names[1:]), rows)
-        # Beside the verdicts, "failed" would read as a verdict, and "ok" as all other verdicts.
-        done = "aligned" if summary.store is None else "built"
-        words = {"ok": done, "failed": f"not {done}"}
-        others = ", ".join(f"{n:,} {words.get(key, key)}" for key, n in summary.statuses.items())
-        say(f"assets:  {total:,} ({others}) in {summary.seconds:,.1f} s")
+        if output.command in ("subset", "concat"):
+            counts = f"assets:  {good:,} copied"
+        else:
+            failed = "not aligned" if summary.store is None else "not built"
+            counts = _counts(summary.statuses, summary.aligned, failed)
+        say(f"{counts} in {summary.seconds:,.1f} s")
         if summary.unchanged:
-            say(f"changed: nothing; {amount(good, 'asset')} reused")
+            say("changed: nothing")
         _say_removed(summary.removed, summary.taken_out, "was")
         if summary.store is not None:
             say(f"store:   {summary.store}")

@@ -19,7 +19,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.parameters.files import checked
 from slatprep.pipeline.before import SHARE, Before, look_back
 from slatprep.pipeline.decoys import DECOYS, measure_build, writable_file
-from slatprep.pipeline.notices import dataset_notices, much_clipped
+from slatprep.pipeline.notices import dataset_notices, moved_ranges, much_clipped
 from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.plan import (
     Action,
@@ -46,7 +46,7 @@ from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.work import spool_of, work_beside, work_directory
 from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
-from slatprep.records import AssetPair, Place
+from slatprep.records import AssetPair, Normalization, Place
 from slatprep.storage.atomic import staged, writing
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
@@ -55,6 +55,8 @@ from slatprep.workers.local import Jobs, require_shared, run_unordered, start_ea
 
 __all__ = ["BuildPlan", "BuildSummary", "Progress", "align_pairs", "build_store", "plan_build"]
 
+
+_ABSENT = (Action.REFUSE, Action.SKIP)
 
 _BROUGHT_ABOUT = (OSError, ArithmeticError, ValueError, MemoryError, RuntimeError)
 """Errors that data and machines cause, unlike faults of slatprep itself."""
@@ -160,13 +162,16 @@ def build_store(
         records, spooled = None, sum(row.spooled for row in new.rows)
         if not before.holds(new):
             records = pack_store(work, place, new, crew.of(spooled))
-        summary = _publish(before, begin, new, records, failed)
+        aligned = sum(
+            bool(row.damaged) or plan[row.asset_id].action is Action.ALIGN for row in new.rows
+        )
+        summary = _publish(before, begin, new, records, failed, aligned)
         if keep_work:
             work.keep_only({row.key for row in new.rows if row.spooled})
         if records is not None:
-            aligned = sum(plan[one].action is not Action.REUSE for one in new.ids)
+            made = sum(plan[one].action is not Action.REUSE for one in new.ids)
             try:
-                measure_build(place.in_place(), aligned, decoys, crew, before.previous)
+                measure_build(place.in_place(), made, decoys, crew, before.previous)
             except (*_BROUGHT_ABOUT, SlatprepError) as error:
                 # The store is published already, and stays.
                 told = f"errors were not measured ({error}); run `slatprep measure-errors`"
@@ -241,10 +246,13 @@ def plan_build(
     place.there = before.previous
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
     plan = plan_assets(pairs, context, crew, before.known, ahead=True)
-    refused = {one for one, planned in plan.items() if planned.action is Action.REFUSE}
-    gone = place.lost({pair.asset_id for pair in pairs} - refused)
-    taken_out = why_taken_out(gone, refused)
-    return BuildPlan(place.out, tuple(plan.values()), before.damaged, taken_out)
+    absent = {one for one, planned in plan.items() if planned.action in _ABSENT}
+    gone = place.lost({pair.asset_id for pair in pairs} - absent)
+    given = wanted.ranges if isinstance(wanted.ranges, Normalization) else None
+    warnings = tuple(moved_ranges(given, place.ranges_there("is"))) if given else ()
+    return BuildPlan(
+        place.out, tuple(plan.values()), before.damaged, why_taken_out(gone, absent), warnings
+    )
 
 
 def align_pairs(
@@ -290,7 +298,7 @@ def align_pairs(
         lambda name: np.array([row.columns[name] for row in rows]),
     )
     build_id = build_id_of(parameters.name, digests)
-    return summarise(counts, failed, begin, records=out, build_id=build_id)
+    return summarise(counts, failed, begin, records=out, build_id=build_id, aligned=len(rows))
 
 
 def _discover(
@@ -310,6 +318,7 @@ def _publish(
     new: NextStore | None = None,
     records: frozenset[int] | None = None,
     failed: Sequence[FailedRecord] = (),
+    aligned: int = 0,
 ) -> BuildSummary:
     """Publish the new or unchanged store with its manifests; note the states of sources.
 
@@ -334,7 +343,8 @@ def _publish(
         begin,
         failed,
         before.standing_files(len(store), records),
-        warnings=tuple(warnings),
+        aligned=aligned,
+        warnings=warnings,
         damaged=(*before.damaged, *damaged),
         rehash_seed=before.seed,
     )

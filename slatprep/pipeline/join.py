@@ -19,6 +19,7 @@ import orjson
 
 from slatprep.errors import ConfigError, StoreError
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.notices import moved_ranges
 from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.publish import BuildSummary, Destination, publish_build
 from slatprep.pipeline.rows import NextStore, Row, SourceStore, in_order
@@ -175,7 +176,9 @@ def _write(
     _require_unclipped(new)
     with work_beside(place.store, look=place.look) as work:
         pack_store(work, place, new, at_most(len(new.rows) // _ROWS_A_JOB, jobs), progress)
-        return publish_build(place, place.in_place(), parameters, begin)
+        sources = {str(source.path): source.normalization for source in new.stores}
+        told = moved_ranges(new.normalization, sources)
+        return publish_build(place, place.in_place(), parameters, begin, warnings=told)
 
 
 def _require_unclipped(new: NextStore) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.consensus import find_consensus
+from slatprep.errors import amount
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
@@ -82,6 +83,28 @@ def much_clipped(store: Store) -> Iterator[str]:
                 f"range{unit} {span.lo:.4g} to {span.hi:.4g}, and were set to the end of it: see "
                 f"normalize.ranges{some if 0 < len(lost) < len(store) else ''}"
             )
+
+
+def moved_ranges(new: Normalization, before: Mapping[str, Normalization]) -> Iterator[str]:
+    """Yield a notice on ends of ranges that moved; `before` has older ranges, by where they are."""
+    moved = {}
+    for where, old in before.items():
+        spans = {one.name: one for one in old.ranges}
+        ends = [
+            f"{end} of {span.name}{' (log10)' * span.log10} from {was:.6g} to {now:.6g}"
+            for span in new.ranges
+            for end in ("lo", "hi")
+            if (was := getattr(spans.get(span.name, span), end)) != (now := getattr(span, end))
+        ]
+        if ends:
+            moved[where] = ", ".join(ends)
+    if moved:
+        where, told = next(iter(moved.items()))
+        more = f" (and {amount(len(moved) - 1, 'other store')})" if len(moved) > 1 else ""
+        yield (
+            f"the ranges are not those of {where}{more}: {told}. All of voxel/properties are on "
+            "the new scale: train anew, or give fixed ranges with --ranges"
+        )
 
 
 def unusual_sources(told: Mapping[str, str], failed: Sequence[FailedRecord] = ()) -> Iterator[str]:

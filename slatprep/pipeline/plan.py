@@ -13,14 +13,14 @@ from enum import StrEnum
 from functools import partial
 from types import MappingProxyType
 
-from slatprep.errors import SlatprepError, StoreError
+from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import Names, SourceStore
 from slatprep.pipeline.seen import as_read
 from slatprep.pipeline.spool import Spool
 from slatprep.readers import hash_sources
-from slatprep.records import AssetPair, Place, SourceFile
+from slatprep.records import AssetPair, Place, SourceFile, Status
 from slatprep.storage.faults import reached
 from slatprep.storage.states import noting
 from slatprep.store.record import AssetRecord
@@ -75,14 +75,15 @@ class Action(StrEnum):
     """Action of a build on an asset.
 
     ``align``: from its sources to the spool. ``reuse``: its alignment is in the existing store.
-    ``resume``: an interrupted build finished it. ``refuse``: it cannot go in. ``remove``: it is in
-    the store but no longer in the dataset.
+    ``resume``: an interrupted build finished it. ``refuse``: it cannot go in. ``skip``: its partner
+    is missing. ``remove``: it is in the store but no longer in the dataset.
     """
 
     ALIGN = "align"
     REUSE = "reuse"
     RESUME = "resume"
     REFUSE = "refuse"
+    SKIP = "skip"
     REMOVE = "remove"
 
 
@@ -119,13 +120,22 @@ class BuildPlan:
     """The planned actions for `assets`, sorted by id, to make or replace a `store`.
 
     `damaged` are damaged parts of the existing store, in words, which will be made anew.
-    `taken_out` says by id why assets will leave the store.
+    `taken_out` says by id why assets will leave the store, and `warnings` are as of a build.
     """
 
     store: Place
     assets: tuple[PlannedAsset, ...]
     damaged: tuple[str, ...] = ()
     taken_out: Mapping[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def statuses(self) -> dict[str, int]:
+        """Number of assets by status, as far as it is known before the build."""
+        counts = self.actions
+        failed, skipped = counts[Action.REFUSE], counts[Action.SKIP]
+        going_in = sum(counts.values()) - failed - skipped - counts[Action.REMOVE]
+        return {Status.OK: going_in, Status.FAILED: failed, Status.SKIPPED: skipped}
 
     @property
     def actions(self) -> dict[str, int]:
@@ -184,7 +194,9 @@ def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
         try:
             sources, digests = hash_sources(pair)
         except SlatprepError as error:
-            return PlannedAsset(pair.asset_id, Action.REFUSE, " ".join(str(error).split()))
+            missing = isinstance(error, MissingPartnerError)
+            action = Action.SKIP if missing else Action.REFUSE
+            return PlannedAsset(pair.asset_id, action, " ".join(str(error).split()))
     planned = _planned(pair, sources, digests, context)
     return replace(planned, seen=as_read(pair, noted))
 

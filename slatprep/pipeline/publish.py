@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.notices import moved_ranges
 from slatprep.pipeline.plan import why_taken_out
 from slatprep.records import Normalization, Place, Status
 from slatprep.storage.atomic import replace_directory
@@ -60,7 +61,8 @@ class Destination:
 
     `out` is the store as its user names it, and `store` its real place, behind a link. `manifests`
     is the folder of its records, if not beside it. `there` is the existing store, if it is open
-    already; `removed` are those of its assets that the new store lacks. ConfigError if there is
+    already; `removed` are those of its assets that the new store lacks, and `ranges` its ranges, if
+    they are known, by words for it. ConfigError if there is
     something other than a store, or it lies in another store. StoreError if the folder holds files
     of other origin or the records of another store.
     """
@@ -86,6 +88,7 @@ class Destination:
         self.there: Store | None = None
         self.replacing = False
         self.removed: list[str] = []
+        self.ranges: dict[str, Normalization] = {}
 
     def look(self) -> None:
         """Read what is published on an object store; StoreError if no store may be there."""
@@ -109,7 +112,7 @@ class Destination:
         `staged` are its files that are on the object store already.
         """
         self.replacing = True
-        self.removed = self.lost(ids)
+        self.removed, self.ranges = self.lost(ids), self.ranges_there("was")
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)
         elif (path := storage_of(self.store).local) is not None:
@@ -119,8 +122,13 @@ class Destination:
     def lost(self, ids: Iterable[str]) -> list[str]:
         """Return the ids of the existing store that are not among `ids`, sorted."""
         with suppress(StoreError):  # There is no store, or its ids cannot be read.
-            return sorted(set((self.there or open_store(self.store)).ids).difference(ids))
+            self.there = self.there or open_store(self.store)
+            return sorted(set(self.there.ids).difference(ids))
         return []
+
+    def ranges_there(self, verb: str) -> dict[str, Normalization]:
+        """Return the ranges of the existing store that `lost` found, for `moved_ranges`."""
+        return {f"the store that {verb} there": self.there.normalization} if self.there else {}
 
     def publish(self) -> None:
         """Make the new version on an object store the current one."""
@@ -258,6 +266,9 @@ class BuildSummary:
         Reason, by id, for the first `PROBLEMS_LISTED` removed assets.
     unchanged : bool
         Whether the existing store stayed as it was.
+    aligned, taken_over : int
+        Assets with status ``ok`` that were aligned; and those that were not, as their alignment is
+        in a store, or an interrupted build finished it.
     """
 
     records: Place
@@ -279,6 +290,8 @@ class BuildSummary:
     removed: int = 0
     taken_out: Mapping[str, str] = field(default_factory=dict)
     unchanged: bool = False
+    aligned: int = 0
+    taken_over: int = 0
 
     @property
     def complete(self) -> bool:
@@ -333,12 +346,16 @@ def publish_build(
     begin: float,
     failed: Sequence[FailedRecord] = (),
     standing: Collection[str] = (),
+    *,
+    aligned: int = 0,
+    warnings: Iterable[str] = (),
     **told: Any,
 ) -> BuildSummary:
     """Publish a store that is in place, with its manifests; return the build's summary.
 
-    `failed` assets could not go in. Files named in `standing` are not checked. `told` are further
-    fields of the summary. StoreError if the manifests cannot be written.
+    `failed` assets could not go in. Files named in `standing` are not checked. `aligned` is the
+    number of assets that were not taken over, and `told` are further fields of the summary.
+    StoreError if the manifests cannot be written.
     """
     folder, names = place.manifests(store.path), file_names(len(store))
     summary = summarise(
@@ -352,6 +369,9 @@ def publish_build(
         removed=len(place.removed),
         taken_out=why_taken_out(place.removed[:PROBLEMS_LISTED], {one.asset_id for one in failed}),
         unchanged=not place.replacing,
+        aligned=aligned,
+        taken_over=len(store) - aligned,
+        warnings=(*warnings, *moved_ranges(store.normalization, place.ranges)),
         **told,
     )
     try:

@@ -93,7 +93,9 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path
     ours = [open_store(tmp_path / f"{name}.zarr").normalization for name in "ab"]
     assert ours[0] != ours[1]
 
-    concat_stores([tmp_path / "a.zarr", tmp_path / "b.zarr"], tmp_path / "all.zarr")
+    summary = concat_stores([tmp_path / "a.zarr", tmp_path / "b.zarr"], tmp_path / "all.zarr")
+    (told,) = summary.warnings
+    assert f"not those of {tmp_path / 'a.zarr'} (and 1 other store): hi of youngs_mod" in told
     assert verify_store(tmp_path / "all.zarr").ok
     joined, built = open_store(tmp_path / "all.zarr"), open_store(tmp_path / "whole.zarr")
     assert joined.normalization == built.normalization

@@ -50,7 +50,8 @@ def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     words = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
     assert "changed" not in run("build-store", *words, "--out", out, "--decoys", "0").stdout
     again = run("build-store", *words, "--out", out, "--decoys", "0", "--verbose").stdout
-    assert "changed: nothing; 3 assets reused" in again and "removed" not in again
+    assert "changed: nothing\n" in again and "removed" not in again
+    assert "assets:  3 (0 aligned, 3 taken over, 0 not built, 0 skipped) in" in again
     rows = [line.split()[:2] for line in again.splitlines() if line[:2] in ("a ", "b ", "c ")]
     assert rows == [[name, "good"] for name in "abc"]
     (dataset.root / "slat" / "a.npz").unlink()
@@ -60,9 +61,32 @@ def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     other = out.with_name("other.zarr")
     assert "removed" not in run("subset", out, "--asset", "b", "--out", other).stdout
     said = run("subset", out, "--asset", "c", "--out", other).stdout
-    assert "assets:  1 (1 built, 0 not built, 0 skipped)" in said and "removed: 1 asset" in said
+    assert "assets:  1 copied in" in said and "removed: 1 asset" in said
     fresh = document("build-store", *words, "--out", other, "--fresh", code=1)
     assert (fresh["removed"], fresh["unchanged"]) == (0, False)
+
+
+def test_ranges_that_move_are_told_and_what_follows(built, tmp_path):
+    dataset, out = built
+    words = ("build-store", "--pixieverse", dataset.root / "pixieverse")
+    words += ("--slat", dataset.root / "slat", "--out", out, "--decoys", "0")
+    assert "ranges" not in run(*words).stderr
+    dataset.add("d", seed=3)
+    grid = dataset.assets["d"].grid
+    grid[..., 0] *= 2
+    dataset.write_grid("d", grid)
+    old = open_store(out).normalization.ranges[1]
+    (told,) = [one for one in document(*words)["warnings"] if "ranges" in one]
+    new = open_store(out).normalization.ranges[1]
+    assert told == (
+        "the ranges are not those of the store that was there: hi of density (log10) from "
+        f"{old.hi:.6g} to {new.hi:.6g}. All of voxel/properties are on the new scale: train anew, "
+        "or give fixed ranges with --ranges"
+    )
+    ahead = run(*words, "--ranges", "pixie", "--dry-run")
+    assert "those of the store that is there: lo of youngs_modulus (log10) from" in ahead.stderr
+    assert "ranges are not those" in run(*words, "--fresh", "--ranges", "pixie").stderr
+    assert "ranges are not those" not in run(*words, "--fresh", "--ranges", "pixie").stderr
 
 
 def test_a_dry_run_counts_what_the_build_removes_and_both_say_why(built):
@@ -74,13 +98,21 @@ def test_a_dry_run_counts_what_the_build_removes_and_both_say_why(built):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     gone = "b (no longer in the dataset)"
     said = f"there: a (cannot be used now), {gone}\n"
-    assert f"removed: 2 assets of the store that is {said}" in run(*words, "--dry-run").stdout
-    assert f"removed: 2 assets of the store that was {said}" in run(*words, code=1).stdout
+    dataset.add("e", seed=5)
+    counted = "assets:  3 (1 aligned, 1 taken over, 0 not built, 1 skipped)"
+    ahead = document(*words, "--dry-run", code=1)
+    assert (ahead["ok"], ahead["removed"]) == (False, 2)
+    for verb, more in (("is", ["--dry-run"]), ("was", [])):
+        printed = run(*words, *more, code=1).stdout
+        assert (
+            counted in printed and f"removed: 2 assets of the store that {verb} {said}" in printed
+        )
     grid = next(dataset.root.glob("pixieverse/**/c*/**/*.npy"))
     grid.write_bytes(grid.read_bytes()[:-100])
     dataset.add("d", seed=3)
     broken = document(*words, code=1)
     assert broken["taken_out"] == {"c": "cannot be used now"}
+    assert (broken["aligned"], broken["taken_over"]) == (1, 1)
     assert any("truncated" in one[1] for one in broken["problems"] if one[0] == "c")
 
 
@@ -172,7 +204,7 @@ def test_a_dry_run_looks_where_the_build_does(built, tmp_path):
     assert plan_build(dataset.parameters(), tmp_path / "s", manifests=own).actions["reuse"] == 3
     sides = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
     words = ("build-store", *sides, "--out", tmp_path / "s", "--manifests", own, "--dry-run")
-    assert "3 to reuse" in run(*words).output
+    assert "3 taken over" in run(*words).output
     assert not own.exists()
 
 
@@ -182,7 +214,14 @@ def test_a_dry_run_writes_nothing(built):
     sources = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
     words = ("build-store", *sources, "--out", out, "--dry-run")
     document = json.loads(run(*words, "--json").stdout)
-    assert document["actions"] == {"align": 0, "reuse": 3, "resume": 0, "refuse": 0, "remove": 0}
+    assert document["actions"] == {
+        "align": 0,
+        "reuse": 3,
+        "resume": 0,
+        "refuse": 0,
+        "skip": 0,
+        "remove": 0,
+    }
     assert all(asset["reason"] == "unchanged" for asset in document["assets"])
     assert "nothing is written" in run(*words).stdout
     assert tree(out.parent) == before
