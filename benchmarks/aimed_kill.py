@@ -1,7 +1,7 @@
-"""Kills a build at one step of it, once; `soak_kills.py` says where and whom.
+"""Kill a build once, at one step of it; `soak_kills.py` sets the step and the process.
 
-Stands at the seam of `slatprep.storage.faults`, in the build and in its workers, also those of a
-cluster that were started long before: the folder named by `FOLDER` holds the aim.
+This module hooks into `slatprep.storage.faults`, in the build and in its workers, including
+long-running workers of a cluster. The aim is a file in the folder that `FOLDER` names.
 """
 
 from __future__ import annotations

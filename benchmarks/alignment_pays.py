@@ -1,19 +1,18 @@
-"""What better alignment buys: one learner on labels of different alignment, against the truth.
+"""Measure how much better alignment helps: the same learner on labels of different alignments.
 
     python benchmarks/alignment_pays.py [--assets 42] [--levels 3 5 6 7] [--draws 12]
 
-For each level, demo objects whose latents come from their true material are
-built into a store by the protocol of SLAT-Phys (``--preset paper``) and into
-one by the default engine; the true labels make a third set, and what is left
-of the second without failed alignments, as training leaves it, a fourth. On
-each, gradient-boosted trees learn the properties and the class of a voxel from
-its latents and position, and all are measured on the same other objects by the
-paper's metrics against the truth, never against labels that an alignment gave.
+For each level, demo objects whose latents come from their true material are built into two
+stores, by the protocol of SLAT-Phys (``--preset paper``) and by the default engine. The true
+labels make a third set. The second store without failed alignments, which training omits,
+makes a fourth. On each set, gradient-boosted trees learn the properties and the class of a
+voxel from its latents and position. All are measured on the same other objects, by the
+paper's metrics and against the truth, never against the labels of an alignment.
 
-A draw takes the objects to learn from with replacement, the same for all sets,
-and seeds the trees. Intervals hold 95 % of the differences to the paper's
-labels over draws and over resampled objects to measure on, so they allow for
-the choice of both. What is built already in --work is not built again.
+A draw samples the training objects with replacement, the same for all sets, and seeds the
+trees. Intervals hold 95 % of the differences to the paper's labels over draws and over
+resampled test objects, so they allow for the choice of both. Stores that are already in
+--work are not built again.
 
 scikit-learn comes with the extra ``paper`` (Open3D needs it).
 """

@@ -1,12 +1,12 @@
-"""Run the measurements that the documentation quotes; write them as JSON and as one page of tables.
+"""Run the measurements that the documentation quotes; write them as JSON and as a page of tables.
 
     python benchmarks/bench.py --quick
     python benchmarks/bench.py --only build-cost scale --out bench.json --page benchmarks.md
 
-Each runs in a process of its own, with a budget of seconds after which it is stopped and said
-to be. What a script prints as JSON becomes a table, what it prints as a table stays one. Of each
-the page says on which machine, at which commit and by which command it was measured; what was
-not run this time keeps its place on the page, from the JSON that is there.
+Each measurement runs in a process of its own. If it exceeds its budget of seconds, it is stopped
+and the page says so. JSON output becomes a table; printed tables are kept. For each measurement
+the page states machine, commit and command. Measurements that do not run this time keep their
+place on the page, taken from the existing JSON.
 """
 
 from __future__ import annotations

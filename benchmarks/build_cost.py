@@ -1,19 +1,19 @@
-"""What a build costs beside reading its inputs and writing the same arrays, and on what.
+"""Measure what a build costs beyond reading its inputs and writing the same arrays, step by step.
 
     slatprep make-demo demo --assets 200
     python benchmarks/build_cost.py demo/dataset.toml
     python benchmarks/build_cost.py demo/dataset.toml --times 8  # as many as PixieVerse has
     python benchmarks/build_cost.py demo/dataset.toml --full
 
-Times are CPU seconds of the process and its children, so that other work on
-the machine hardly matters; two jobs against one is wall clock and needs two
-free cores, and so is verifying. Every step is run once before it is timed, so nothing is compiled.
+Times are CPU seconds of the process and its children, so other work on the machine hardly
+matters. Verifying, and two jobs compared with one, are in wall-clock seconds and need two free
+cores. Every step runs once before it is timed, so no compilation is measured.
 
-With --times each asset goes in under so many ids, by hard links: of a dataset as large
-as PixieVerse few assets need be made.
+With --times, hard links give each asset this number of ids. A few assets then stand for a
+dataset as large as PixieVerse.
 
-With --full the same of assets whose SLAT has every voxel of the grid, or every
-other one, and whose PixieVerse grid is one of the dataset, a cube, two voxels or dust.
+--full measures the same with assets whose SLAT has every voxel of the grid, or every other
+voxel. Their PixieVerse grid is one of the dataset, a cube, two voxels or dust.
 """
 
 from __future__ import annotations

@@ -3,16 +3,16 @@
     python benchmarks/calibrate.py demo.npz ... [--fit [--numbers slatprep/judge/calibration.json]]
                                    [--picture docs/images/confidence.svg]
 
-Two questions of an alignment: do both sides show the same object, and if they do, is its
-placement right? And one of a voxel: is its class right? Logistic regressions answer them, whose
-weights may only have the sign that makes sense (a better fit never lowers a confidence); of
-voxels then a curve, from isotonic regression on the same rows, that sets their
-probabilities right. Alignments are weighed to the mix `PRIOR`.
+Logistic regressions answer two questions about an alignment: do both sides show the same object,
+and if so, is its placement right? A third answers whether the class of a voxel is right. A weight
+may only have the sign that makes sense: a better fit never lowers a confidence. For voxels,
+isotonic regression on the same rows then corrects the probabilities. Alignments are weighted to
+the mix `PRIOR`.
 
-With --fit the file of numbers gets what is fitted to all tables. All that is printed and drawn is
-of objects that had no part in the fit: their seeds are divided into `PARTS`, and each part is
-judged by what is fitted to the others. Without it the shipped numbers are tested, on other objects
-only if those of the tables are.
+--fit writes the file of numbers, fitted to all tables. All printed and drawn results are for
+objects that are not in the fit: seeds are divided into `PARTS`, and each part is judged by a fit to
+the others. Without --fit the shipped numbers are tested. That test is on new objects only if the
+tables' objects are not those of the shipped fit.
 """
 
 from __future__ import annotations

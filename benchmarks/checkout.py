@@ -1,4 +1,4 @@
-"""What scripts share that build in processes of their own, from the made data of the tests."""
+"""Help scripts that build in processes of their own, from the synthetic data of the tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a build costs on a Dask cluster, and what passes through the machine of the command.
+"""Measure what a build costs on a Dask cluster, and its traffic through the command's machine.
 
     slatprep make-demo demo --assets 200
     python benchmarks/cluster.py cost demo/dataset.toml --workers 2
@@ -6,17 +6,16 @@
     python benchmarks/cluster.py traffic demo/dataset.toml --workers 2
 
 ``cost`` compares a cluster with the same number of processes, both on this machine. CPU seconds are
-those of all processes, so that other work on the machine hardly matters; wall clock needs as many
-free cores as workers. Each is run once before it is measured, so nothing is compiled or loaded, and
-no process is started. Workers get the environment that docs/cluster.md advises, unless
-``--as-installed`` is given. ``--empty N`` hands out N tasks that do nothing instead, to find the
-number a second that one scheduler and one command reach, however many workers there are.
+summed over all processes, so other work on the machine hardly matters; wall-clock time needs as
+many free cores as workers. Each runs once before it is measured, so compiling, loading and starting
+processes are not measured. Workers get the environment that docs/cluster.md advises, unless
+``--as-installed`` is given. ``--empty N`` instead distributes N tasks that do nothing. This gives
+the number per second that one scheduler and one command reach with any number of workers.
 
-``traffic`` builds a store on an object store. Sources and store lie on moto's S3, each worker has a
-folder of its own for temporary files, and every byte between the command and the scheduler, between
-the command and S3, and between the workers and S3 goes through a counter of its own. Prints bytes
-an asset, both ways together, of a build with any number of assets: what a build moves once is in
-it.
+``traffic`` builds a store on an object store. Sources and store are on moto's S3, and each worker
+has its own folder for temporary files. Separate counters count all bytes between command and
+scheduler, command and S3, and workers and S3. Prints bytes per asset of a build, in both directions
+together. They include the bytes that a build transfers once, for any number of assets.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Gather what is measured of right and of wrong placements, for the calibration of confidence.
+"""Collect figures of right and wrong placements, for the calibration of confidence.
 
     python benchmarks/confidence.py table.npz [--assets 14] [--levels 0 1 2 3 4 5 6 7]
                                     [--seeds 101 102] [--jobs 2]
@@ -7,22 +7,23 @@
     python benchmarks/confidence.py table.npz --lumps [--assets 28] [--seeds 1011]
     python benchmarks/confidence.py table.npz --dataset DIR ... [--real]
 
-Demo assets of each level, pairs of generated shapes of one object (`generations.py`), objects on
-slabs of ground (`ground.py`), pairs that differ by lumps (`lumps.py`), or the assets of
-datasets with a truth, are aligned by the default engine. Each row of the table is one alignment:
+The default engine aligns demo assets of each level, pairs of generated shapes of one object
+(`generations.py`), objects on slabs of ground (`ground.py`), pairs that differ by lumps
+(`lumps.py`), or the assets of datasets with a truth. Each row of the table is one alignment:
 
 own      an asset's field on its own SLAT, as the engine places it;
-heading  the same, with all placements hidden from the engine that lie within 3 voxels of
-         the right one: what it would say if it had missed that;
+heading  the same, but the engine cannot see placements within 3 voxels of the right placement,
+         so that it finds what it would find after missing it;
 other    an asset's field on the SLAT of another object.
 
-Each row has the truth (``placed``, within 1.5 voxels of the best similarity, of real pairs, whose
-differences blur it, within 30 degrees and 4 voxels; never for another object), the share of
-right labels, and `slatprep.judge.evidence.FIGURES`. Of its valid voxels an even choice has
-``voxel_*``: figures, whether the class is right, and the row.
+Each row has the truth ``placed``, the share of right labels, and
+`slatprep.judge.evidence.FIGURES`. ``placed`` means within 1.5 voxels of the best similarity; for
+real pairs, whose differences blur the truth, within 30 degrees and 4 voxels; it is false for
+another object. An even choice of the row's valid voxels has ``voxel_*``: figures, whether the class
+is right, and the row.
 
-`benchmarks/calibrate.py` fits to some tables and tests on others. Objects are other ones
-if their seeds are.
+`benchmarks/calibrate.py` fits to some tables and tests on others. Objects with different seeds are
+different objects.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Coherent Point Drift of the package pycpd, affine and deformable, as a baseline.
+"""Align by Coherent Point Drift of the package pycpd, affine and deformable, as a baseline.
 
 The method is that of A. Myronenko and X. Song, "Point Set Registration:
 Coherent Point Drift", IEEE TPAMI 32(12), 2010, with their weights. It finds no
 orientation by itself, so it runs from the 24 start rotations that every engine
-has, affinely and on thinned clouds; the best one goes on with more points.
-What is drifted is the SLAT, as its voxels are what is looked up.
+has, affinely and on thinned clouds. The best result is refined with more points.
+The SLAT is the cloud that drifts, because its voxels are looked up.
 """
 
 from __future__ import annotations

@@ -1,19 +1,17 @@
-"""Damage a store, bit by bit and more grossly, and see that no harm comes of it.
+"""Damage a store, bit by bit and more severely, and check that no harm comes of it.
 
     python benchmarks/damage.py --minutes 30 --seed 1
     python benchmarks/damage.py --flips 100000 --stores 5000
 
-Flips: one bit of one file of a store, or of the records beside it. Each must be
-found by what `slatprep verify` does, or healed by the next build, or be without
-meaning: white space in JSON, and when, where and how long a build ran; one of
-`sources.seen` costs the next build some hashing. Of some
-that are found, the whole of `verify_store` and the next build are run: the
-store must then be, byte for byte, the one that it was, or refused in words.
+Flips: one bit changes in one file of a store or of the records beside it. The checks of
+`slatprep verify` must find each flip, or the next build must repair it, or it must have no
+meaning: white space in JSON, or when, where and how long a build ran. A flip in `sources.seen`
+only costs the next build some hashing. For some of the found flips, all of `verify_store` and the
+next build run: the store must then equal the original, byte for byte, or be refused in words.
 
-Stores: a file of a store is cut, emptied, removed, exchanged, overwritten, or an
-entry of its JSON replaced by something hostile; then a command that reads stores
-runs. It must end with an exit code of its own, and not with a traceback. Every
-harm is printed, and makes the exit code 1.
+Stores: a file of a store is cut, emptied, removed, exchanged or overwritten, or an entry of its
+JSON is replaced by a hostile value; then a command that reads stores runs. It must end with one of
+its exit codes, not with a traceback. Every harm is printed, and makes the exit code 1.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Try ways to harm a build or a reader that need more than a damaged file.
+"""Try to harm a build or a reader in ways that need more than a damaged file.
 
     python benchmarks/doors.py cluster|multipart|slow|swapped
     python benchmarks/doors.py clock --faketime /usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1
 
 cluster: a worker, then the scheduler, of a Dask cluster is killed at each step of a build to S3.
 multipart: a store with files of 40 and 112 MiB goes to S3 in parts of 16 MiB; requests fail.
-slow: every connection to S3 carries 1,000 bytes a second; stalled: S3 takes calls and says nothing.
+slow: every connection to S3 carries 1,000 bytes per second; stalled: S3 accepts calls but does not
+answer.
 swapped: S3 answers for one file of a store with the same file of another store of equal shape.
-clock: sources change, and the clock is set an hour back, or forth, between two builds.
+clock: sources change, and the clock is set an hour back or forward between two builds.
 
-What each is run for must end as without faults, or in an error in words with the old store whole;
-the same run without faults must then succeed. Prints how often each came out how; harm makes the
-exit code 1.
+Each run must end as without faults, or in an error in words with the old store whole; the same run
+without faults must then succeed. Prints the number of each outcome; harm makes the exit code 1.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Say what becomes of verdicts and stated errors at the ends of what datasets may be.
+"""Measure verdicts and stated errors for datasets at the extremes.
 
     python benchmarks/ends.py [--assets 126] [--seed 61] [--levels 5 6 7] [--jobs 2]
 
 Datasets of demo objects: one asset, ten, all, all with a fifth of the SLATs shuffled among
-themselves, all with all SLATs shuffled, and as many balls. Printed of each: the assets, how many
-pairs are wrong, how many assets are good and failed, how many wrong ones are good and in how many
-of these both objects are of one category, and what the decoys say.
+themselves, all with all SLATs shuffled, and the same number of balls. For each it prints the number
+of assets, of wrong pairs, of good and of failed assets, and of wrong pairs that are good. It also
+prints how many of the latter show two objects of one category, and what the decoys state.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Alignment engines side by side: right or wrong, how exact, how fast.
+"""Compare alignment engines: whether they are right, how exact and how fast they are.
 
     python benchmarks/engines.py --data DIR --engine field --engine open3d-64
 
-Every engine aligns every asset in turn, so that a machine that slows down
-slows all of them; times are processor seconds of one thread.
+For each asset all engines run in turn, so that a machine that slows down
+slows all of them; times are CPU seconds of one thread.
 """
 
 from __future__ import annotations

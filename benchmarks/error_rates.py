@@ -2,13 +2,14 @@
 
     python benchmarks/error_rates.py table.npz ... [--wrong 0 0.05 0.2 0.35 1] [--draws 12]
 
-A dataset is drawn from right alignments, with a share of alignments to SLATs of other objects
-mixed in as if files were paired wrongly; other such alignments are its decoys. Printed by that
-share, mean and worst of the draws: the share that is stated and whether its interval holds the
-truth; of those called good, how many are stated to be wrong and how many are; at a stated rate of
-0.01 the true rate, and the share of the right ones that is kept, beside the share called good.
+A dataset is drawn from right alignments, with a share of alignments to SLATs of other objects,
+as if files were paired wrongly; further alignments to other objects are its decoys. For each share,
+it prints means over the draws: the stated share of wrong pairs, and how often its interval holds
+the true share; the true and the stated number of wrong pairs among good alignments. At a stated
+rate of 0.01 it prints the true rate, mean and worst, and the share of right alignments that is
+kept, beside the share that is called good.
 
-Tables of objects that had no part in the fit of the shipped model tell most.
+Tables of objects that were not in the fit of the shipped model are the strongest test.
 """
 
 from __future__ import annotations

@@ -1,20 +1,18 @@
-"""Use stores on an object store whose answers are spoiled, and see that no harm comes of it.
+"""Use stores on an object store that gives faulty answers, and check that no harm comes of it.
 
     python benchmarks/faulty_s3.py --minutes 30 --seed 1
     python benchmarks/faulty_s3.py --runs 40
 
-moto's S3 answers on loopback, behind a proxy that spoils a share of the answers by the seed:
-errors of the server (500, 503 SlowDown, 403, 404), connections that are reset before or after
-the server did what it was asked, requests that it gets twice, bodies that are cut, shorter,
-longer, flipped in a bit or those of another object, delays, listings and pointers that are out of
-date, and 409 or 412 where a write has a condition.
+moto's S3 answers on loopback, behind a proxy that makes a share of the answers faulty, drawn by the
+seed: server errors (500, 503 SlowDown, 403, 404); connections reset before or after the server
+did its work; requests that arrive twice; bodies that are cut, shorter, longer, of another object or
+have a flipped bit; delays; outdated listings and pointers; and 409 or 412 for a conditional write.
 
-Each run builds a store there or brings one up to date, builds from sources that lie there, or
-verifies, reads, copies, exports or reports one. It must end in what the same gives
-without faults, byte for byte, or in an error in words; the store that was there must then still
-be there, and a message may not say that nothing changed where something did. After every
-update that was refused the same is run without faults, and must succeed. Every harm is printed,
-and makes the exit code 1.
+Each run builds a store on S3 or updates it, builds from sources on S3, or verifies, reads,
+copies, exports or reports a store. It must give the same result as without faults, byte for byte,
+or end in an error in words. After an error the old store must still exist, and a message must not
+say that nothing changed if something did. After every refused update the same command runs without
+faults, and must succeed. Every harm is printed, and makes the exit code 1.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Build on disks that run full: the old store or the new one must be there, and one line told.
+"""Build on disks that become full: the old or the new store must exist, and one line must say why.
 
     python benchmarks/full_disk.py --minutes 5 --seed 1
 
 Each try mounts a tmpfs with too few bytes, or too few inodes, and builds, updates,
-exports or reports there. Mounting needs root; without it the script says so and ends.
-Afterwards the disk is made larger, and the same command must give what it gives
-anywhere. Every harm is printed, and makes the exit code 1.
+exports or reports on it. Mounting needs root; without it the script says so and ends.
+Afterwards the disk is enlarged, and the same command must give the same result as on any
+other disk. Every harm is printed, and makes the exit code 1.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The forms of source files, and how the bytes of one are damaged."""
+"""Write source files in each of their forms, and damage their bytes."""
 
 from __future__ import annotations
 

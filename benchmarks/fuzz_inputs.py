@@ -2,17 +2,15 @@
 
     python benchmarks/fuzz_inputs.py [--files 5000] [--builds 200] [--seed 0] [--format NAME ...]
 
-Files of a demo dataset are damaged in every way that is cheap to think of:
-flipped and replaced bytes, cuts, insertions, truncation, blocks of zeros,
-damaged headers, impossible values, and arrays damaged before they were put
-into a sound archive. Every file must be refused with slatprep's own error or
-read to a valid record; where another library can read the file as well, to
-the same values. A process that crashes, hangs (20 s a file) or takes more
-than 600 MB counts as a fault, as does any other exception. Files are read in
-processes of their own, so a crash is one fault and not the end.
+Files of a demo dataset are damaged in many cheap ways: flipped and replaced bytes, cuts,
+insertions, truncation, blocks of zeros, damaged headers, impossible values, and arrays damaged
+before they are put into a sound archive. slatprep must refuse a file with its own error or read a
+valid record; if another library can read the file too, the values must be the same. A process that
+crashes, hangs (20 s per file) or takes more than 600 MB counts as a fault, as does any other
+exception. Files are read in separate processes, so a crash is one fault and not the end.
 
-Whole builds take datasets of which three assets in four have one damaged file;
-each must finish with the sound ones, and the store must pass `slatprep verify`.
+Whole builds take datasets in which three of four assets have one damaged file. Each build must
+finish with the sound assets, and the store must pass `slatprep verify`.
 """
 
 from __future__ import annotations

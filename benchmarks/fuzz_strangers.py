@@ -1,11 +1,11 @@
-"""Feed hostile checkpoints and PLY files to their readers, and measure what a refusal costs.
+"""Feed hostile checkpoints and PLY files to their readers, and measure the cost of a refusal.
 
     python benchmarks/fuzz_strangers.py [--files 500] [--seed 0] [--kind checkpoint|ply]
 
-Checkpoints are changed in their values, their pickle, their archive and their bytes; PLY files are
-written by a grammar that knows what readers differ about. One file in eight is made 20 to 100 MB
-large. Each file is read in a process of its own. It must be read, or refused with slatprep's own
-error; a refusal may take 200 MB and 2 s of CPU, and no file a minute or more than 1 GB.
+Checkpoints are changed in their values, their pickle, their archive and their bytes. PLY files
+come from a grammar of features on which readers differ. One file in eight is enlarged to 20 to
+100 MB. Each file is read in a process of its own. It must be read, or refused with slatprep's own
+error. A refusal may take 200 MB and 2 s of CPU; no file may take a minute or more than 1 GB.
 """
 
 from __future__ import annotations

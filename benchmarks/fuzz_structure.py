@@ -1,10 +1,10 @@
-"""Change the structure of voxel files (npz, HDF5, Zarr, PLY), and see that none is read wrongly.
+"""Change the structure of voxel files (npz, HDF5, Zarr, PLY), and check that none is read wrongly.
 
     python benchmarks/fuzz_structure.py [--files 300] [--seed 0]
 
-Each change either loses or contradicts something, and the file must be refused with slatprep's own
-error, or it keeps all values, and they must be read as they were. Whatever else comes of it is a
-fault: other values, another exception, or more than 30 s.
+If a change loses or contradicts something, slatprep must refuse the file with its own error. If it
+keeps all values, they must be read unchanged. Any other result is a fault: other values, another
+exception, or more than 30 s.
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
-"""Align two shapes that a generator made up of one object, and judge the result.
+"""Align two shapes that a generator made of one object, and judge the result.
 
     python benchmarks/generations.py [--objects 44] [--seeds 901] [--bends 2 3] [--jobs 2]
 
 Both sides of a pair are generated shapes of level 5, each with its own
-proportions and its own bend: the first one, filled, stands for the PixieVerse
-field. With ``--torn`` bites are taken out of both, and each gets a lump that
-the other one lacks, as generators leave parts away and make others up.
+proportions and its own bend: the first shape, filled, is the PixieVerse field.
+With ``--torn`` bites are removed from both, and each gets a lump that the other
+lacks, because generators omit parts and invent others.
 
 The true place of a voxel is the voxel of the first shape that shows the same
-point of the object. Printed by bend, of objects that are not symmetric:
+point of the object. For each bend it prints, over objects that are not symmetric:
 
 apart     95th percentile of the distance between the shapes under the best
           similarity, in voxels, median over pairs;
-heading   share of pairs whose rotation is within 45 degrees of that one's;
-the verdicts of those pairs, of the others, and of SLATs of other objects.
+heading   share of pairs whose rotation is within 45 degrees of the best similarity's;
+the verdicts of these pairs, of the other pairs, and of SLATs of other objects.
 """
 
 from __future__ import annotations

@@ -1,24 +1,25 @@
-"""Align objects whose annotation holds a slab of ground, which no SLAT has, and judge the result.
+"""Align objects whose annotation has a slab of ground, which no SLAT has, and judge the result.
 
     python benchmarks/ground.py [--seeds 501] [--levels 1 6 7] [--jobs 2]
 
 Objects are one of each category of the demo, and six that are flat or wide themselves.
-They fill the grid, or leave 6 or 10 voxels on each side. Under each is put, in turn,
+They fill the grid, or leave 6 or 10 voxels on each side. Each object is placed, in turn, on
 
 none     nothing;
 foot     a disc of 0.9 to 1.4 times the object's radius, 1.5 to 4 voxels thick, as all but thin;
-wide     one of 1.5 to 2.2 times that radius;
+wide     a disc of 1.5 to 2.2 times this radius;
 thin     a slab as wide as the grid, a voxel thick;
 full     a slab as wide as the grid;
-tilted   one tilted by 5 to 15 degrees against the object, half of them discs;
-rough    one of uneven thickness, with holes.
+tilted   a slab or a disc (half of each), tilted by 5 to 15 degrees against the object;
+rough    a slab of uneven thickness, with holes.
 
-Its top lies up to 1.5 voxels above the object's foot; its class is any, in a quarter of
-the cases one of the object's. Printed for objects that are not symmetric, by the engine as
-it is and by one that does not look for ground: the share that is placed right (within
-1.5 voxels of the best similarity), median displacement, mean share of right labels beside that of
-the true places, and the verdicts of right and of wrong placements; those of SLATs of
-other objects, on the slab `full`; and the wrong ones that are good, with their labels.
+The top of the ground lies up to 1.5 voxels above the object's foot. Its class is any class; in a
+quarter of the cases it is one of the object's. Results are for objects that are not symmetric, with
+the engine as it is and with an engine that does not look for ground. They are the share of right
+placements (within 1.5 voxels of the best similarity), the median displacement, the mean share of
+right labels beside that of the true places, and the verdicts of right and wrong placements. Further
+results are the verdicts of SLATs of other objects, on the slab `full`, and the wrong placements
+that are good, with their labels.
 """
 
 from __future__ import annotations

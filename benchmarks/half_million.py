@@ -1,11 +1,11 @@
-"""What grows with the number of assets and with nothing else: tiny assets, alignments given.
+"""Measure costs that depend only on the number of assets, with tiny assets and known alignments.
 
     python benchmarks/half_million.py 500000
 
-Sources are as small as their format allows, some hundred voxels a side, and state their frame
-(engine ``known``), so that nothing is searched. Each step runs in a process of its own: the first
-build, one that finds nothing changed, an update by some new assets, opening, reading at random,
-verifying, and the report. Wall time, CPU time with children and peak memory are printed for each.
+Sources are as small as their format allows, some hundred voxels on each side, and state their frame
+(engine ``known``), so no search runs. Each step runs in a process of its own: the first build, a
+build that finds no changes, an update by some new assets, opening, reading at random, verifying,
+and the report. It prints wall time, CPU time with children and peak memory of each.
 """
 
 from __future__ import annotations

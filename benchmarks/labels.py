@@ -1,4 +1,4 @@
-"""Labels: which way to look them up is right, what latents settle, and what a model could learn.
+"""Compare ways to look up labels, and measure what latents settle and what a model could learn.
 
     python benchmarks/labels.py lookup DIR [DIR ...]
     python benchmarks/labels.py witness DIR [--jobs N]
@@ -7,25 +7,26 @@
 Each DIR holds a dataset with truth, as `slatprep make-demo` writes it.
 
 ``lookup`` compares the nearest annotated voxel (the paper's way) with a vote of the 27 nearest
-annotated voxels. It is weighted by a Gaussian of their distance (its width in voxels), with
-properties averaged over the voxels of the winning class, or taken from the nearest one of it
-("near"). Printed per level, under the transform that the default engine finds: the share of right
+annotated voxels. Votes are weighted by a Gaussian of their distance (its width in voxels).
+Properties are averaged over the voxels of the winning class, or taken from the nearest of them
+("near"). It prints per level, with the transform that the default engine finds: the share of right
 classes over all voxels and over those within two voxels of another class, and the mean absolute
 error of log10 E, log10 density and Poisson's ratio.
 
-``witness`` takes a dataset of ``make-demo --latents material``. Two stores are built of it in a
-temporary folder, without and with the pass that compares labels with latents. An asset counts as
-tied if a placement that fits as well as the chosen one gives other classes to more than 5 % of the
-voxels that have one under all of them. It is settled right if no tied placement would have more
-right classes there, but for 2 %: of a ball whose placements form a continuum, none may be the true
-one. Printed beside that: assets without a tie whose row changed, and the share of right classes of
-the assets that latents contradict and of the worst ones they do not.
+``witness`` takes a dataset of ``make-demo --latents material``. It builds two stores in a temporary
+folder, without and with the pass that compares labels with latents. An asset counts as tied if a
+placement that fits as well as the chosen placement changes the class of more than 5 % of the
+voxels; only voxels with a class under all tied placements count. It is settled right if no tied
+placement would have over 2 % more right classes on these voxels. The 2 % allow for a ball, whose
+placements form a continuum that may not include the true one. It also prints the assets without
+a tie whose row changed, and the share of right classes of the assets that latents contradict and of
+the worst assets that they do not contradict.
 
-``bound`` takes a store of such a dataset, the formula of whose latents is known
-(`slatprep.demo.latents`). The posterior mean of the properties given a voxel's latents and
-position, with the materials of the training voxels as the prior, has the least expected squared
-error of all models that look at one voxel at a time. A lower error on the same validation objects
-has looked at the neighbours.
+``bound`` takes a store of such a dataset, whose latents follow a known formula
+(`slatprep.demo.latents`). The posterior mean of the properties, given a voxel's latents and
+position and with the materials of the training voxels as the prior, has the lowest expected squared
+error of all models that see one voxel at a time. A model with a lower error on the same validation
+objects uses neighbouring voxels.
 """
 
 from __future__ import annotations

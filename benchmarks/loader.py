@@ -1,12 +1,12 @@
-"""Loading for training: the store against the same loop over npz files.
+"""Compare loading for training from a store with the same loop over npz files.
 
     python benchmarks/loader.py STORE [--repeats 5]
 
 Writes each asset's coords, feats, properties, material and valid as an npz
-file, plain and compressed, then reads all assets in the same shuffled order in
-each way, turn by turn so that a busy machine slows all alike. Both ways end in
-the same tensors, which is checked. Prints milliseconds of CPU time an asset
-(median over repeats) and the size on disk.
+file, plain and compressed. It then reads all assets in the same shuffled order in
+each way, in turn, so that a busy machine slows all ways alike. It checks that all ways
+give the same tensors. Prints milliseconds of CPU time per asset (median over
+repeats) and the size on disk.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Pairs of shapes of one object that differ by lumps: near-perfect here, quite another there.
+"""Make pairs of shapes of one object that differ by lumps: near-perfect in places, wrong in others.
 
-Two generations of one object, or a scan and a generation of it, differ like that: a chimney
-more, other cushions, a thicker leg. Both sides are a solid of the demo, the SLAT's bent a
-little; then pieces of either are added, left out, grown, thinned or moved. The annotation is
-turned by a quarter turn and a tilt of up to 15 degrees, and half of them are rough.
+Two generations of one object, or a scan and a generation, differ in this way: an extra
+chimney, other cushions, a thicker leg. Both sides are a solid of the demo, with the SLAT's bent
+slightly; then pieces of either side are added, omitted, grown, thinned or moved. The annotation
+is turned by a quarter turn and a tilt of up to 15 degrees, and half of the annotations are rough.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""PixieVerse from a hub: how much of it is asked for on the way to a verified store.
+"""Measure how much of PixieVerse a build reads from a hub until it has a verified store.
 
     python benchmarks/published.py FOLDER [--objects 12] [--frames 100] [--latency 0.1]
 
-Writes archives by class as Pixie's code writes them, at true size but sparse, and serves them as
-the hub does, each answer late by the latency. Builds a store by one command from the dataset's
+Writes archives by class as Pixie's code does, at true size but sparse, and serves them like
+the hub, with each answer delayed by the latency. Builds a store by one command from the dataset's
 name, verifies it, and builds it again. Prints requests and bytes, and whether the store equals
-that of the unpacked folder and that of the archives on the disk. Then prints what the index of an
-archive takes, by number and size of an object's frames.
+the stores of the unpacked folder and of the archives on the disk. Then prints the cost of an
+archive's index, by number and size of an object's frames.
 """
 
 from __future__ import annotations

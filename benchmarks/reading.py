@@ -1,9 +1,9 @@
-"""Reading for training: random whole assets, by slatprep and by what one would do without it.
+"""Compare reading random whole assets for training, by slatprep and by the alternatives.
 
     python benchmarks/reading.py STORE.zarr
 
 Every way reads the same arrays of the same assets, in the same shuffled
-order, and takes its turn in every repeat, so that a machine that slows down
+order. All ways run in turn in every repeat, so that a machine that slows down
 slows all of them.
 """
 

@@ -1,19 +1,18 @@
-"""Reading from an object store: in place or from a copy, and by what one would do otherwise.
+"""Measure reading from an object store, in place or from a copy, beside the alternatives.
 
     python benchmarks/remote.py steps STORE [--latency 0.03] [--assets 50]
     python benchmarks/remote.py ways STORE [--latency 0.02] [--assets 60]
 
-``steps`` uploads a local store to moto's server on loopback, which stands in for S3: each request
-is made to wait as long as one to S3 does, and nothing limits the bandwidth. Prints seconds to
-publish, to open, to read an asset's coords, feats and properties in shuffled order, and to copy,
-and the requests each takes.
+``steps`` uploads a local store to moto's server on loopback, in place of S3. Each request waits as
+long as a request to S3, and bandwidth is not limited. It prints seconds and requests to publish, to
+open, to read an asset's coords, feats and properties in shuffled order, and to copy.
 
-``ways`` reads from this machine's disk, as the system remembers it, and from S3: a server on
-loopback answers requests for objects as S3 does, each after the latency. Every way reads coords,
-feats and properties of the same assets in the same shuffled order, from one, two and four processes
-at a time, each with its part of them; WebDataset, which reads its shards from end to end, in the
-order that it shuffles itself. Prints milliseconds an asset and process, best of the repeats, after
-one asset that opens what has to be opened, and requests an asset.
+``ways`` reads from this machine's disk, with warm caches, and from S3: a server on loopback that
+answers requests for objects like S3, each after the latency. Every way reads coords, feats and
+properties of the same assets in the same shuffled order, from one, two and four processes at a
+time, each with its share of them. Only WebDataset, which reads its shards from end to end, takes
+the order that it shuffles itself. It prints milliseconds per asset and process, the best of the
+repeats, after a first asset that opens everything, and requests per asset.
 """
 
 from __future__ import annotations

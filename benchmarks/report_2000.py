@@ -1,14 +1,13 @@
-"""Measure the page of a large store: its size, and how soon it can be used.
+"""Measure the page of a large store: its size, and the time until it can be used.
 
     python benchmarks/report_2000.py STORE.zarr [--assets 2000] [--noise 0.05] [--jobs 2]
 
-STORE.zarr is any store with its records beside it or in manifests/build/NAME; its
-assets are repeated, each with a noise of its own added to the normalised properties if asked for,
-until there are enough. The page is then opened from disk in a fresh headless
-Chromium, several times. Printed: the page's bytes, the seconds to make it,
-and in milliseconds the median time from opening the file to a table that can
-be used, to the end of loading, to the first picture of an asset in 3D, and
-the longest frame while the table is scrolled from end to end.
+STORE.zarr is any store with its records beside it or in manifests/build/NAME. Its
+assets are repeated until there are enough; with --noise, each repeat gets its own noise in the
+normalised properties. A fresh headless Chromium then opens the page from disk, several times. It
+prints the page's size in bytes, the seconds to make it, and in milliseconds the median time
+from opening the file to a usable table, to the end of loading and to the first picture of
+an asset in 3D, and the longest frame while the table is scrolled from end to end.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Cost, memory and files of builds and updates against the number of assets.
+"""Measure cost, memory and files of builds and updates by number of assets.
 
     python benchmarks/scale.py 100 1000 10000
     slatprep make-demo demo --assets 24 && python benchmarks/scale.py 10000 --like demo
 
-Sources are small made assets, or those of a demo (``--like``), which are as large as
-PixieVerse's; their files are linked, so that any number fits anywhere. Time is CPU time of the
-build and its workers. The second build finds that nothing changed, the third gets new assets
-(``--new``), the fourth loses one.
+Sources are small synthetic assets, or those of a demo (``--like``), which are as large as
+PixieVerse's; their files are linked, so that any number fits on a disk. Time is CPU time of the
+build and its workers. The second build finds no changes, the third gets new assets (``--new``),
+the fourth loses an asset.
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
-"""Kill builds, many of them, at random times or at a phase by name; look at what is left.
+"""Kill many builds, at random times or in a given phase, and check the files that remain.
 
     python benchmarks/soak_kills.py --kills 200 --assets 12
     python benchmarks/soak_kills.py --phase pack --phase publish --minutes 20 --seed 3
     python benchmarks/soak_kills.py --phase pack --dask --minutes 20
 
-A dataset that keeps changing (an asset appears, changes or goes before each
-build) is built into one store, and each build is killed with SIGKILL: the
-whole process group, the parent alone, or one worker; after a random time, or,
-with --phase, at a random step of that phase. With --dask two workers of a
-Dask cluster compute, which outlives the builds. After every kill the store is
-opened with plain zarr and read whole, and must be, byte for byte, one of the
-stores that an undisturbed build wrote of an earlier or the present state; of
-the present one, if the build ended well. Of the records beside it `verify` must find that they
-are another build's, or they must be those of the undisturbed build. At the end a last build runs
-undisturbed and must equal one from nothing. Builds are told to order rows by id.
+A dataset that keeps changing (an asset appears, changes or goes before each build) is built into
+one store, and each build is killed with SIGKILL: the whole process group, the parent alone, or
+one worker. The kill comes after a random time or, with --phase, at a random step of the
+phase. With --dask two workers of a Dask cluster compute, which outlives the builds.
+
+After every kill, plain zarr opens the store and reads all of it. The store must equal, byte for
+byte, the store of an undisturbed build of an earlier or the present state; of the present state, if
+the build ended well. The records beside it must be those of the undisturbed build, or `verify` must
+find that they belong to another build. At the end a last build runs undisturbed and must equal a
+build from nothing. Builds sort rows by id.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Hold each room of the package to its budget of code lines, as CONTRIBUTING.md lists them.
+"""Check that each room of the package keeps its budget of code lines, listed in CONTRIBUTING.md.
 
     python tools/budget.py
 
-A code line is one that is neither blank, comment nor docstring. A room over its budget fails;
-raising the number is a line in the change that needs it.
+A code line is a line that is neither blank, comment nor docstring. A room over its budget fails;
+a change that needs more lines also raises the number.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, to
 
 
 def code_lines(text: str) -> int:
-    """Return how many lines of a module hold code."""
+    """Return the number of code lines of a module."""
     docstrings: set[int] = set()
     for node in ast.walk(ast.parse(text)):
         body = getattr(node, "body", None)
         for entry in body if isinstance(body, list) else []:
-            # Also the strings that describe a field or a constant.
+            # These include the strings that describe a field or a constant.
             if isinstance(entry, ast.Expr) and isinstance(entry.value, ast.Constant):
                 docstrings |= set(range(entry.lineno, (entry.end_lineno or 0) + 1))
     lines: set[int] = set()
@@ -38,7 +38,7 @@ def code_lines(text: str) -> int:
 
 
 def rooms() -> dict[str, int]:
-    """Return the code lines of each room; what lies at the top of the package is one of them."""
+    """Return the code lines of each room; modules at the top of the package form a room."""
     counts: dict[str, int] = {}
     for file in sorted((TOP / "slatprep").rglob("*.py")):
         folders = file.relative_to(TOP / "slatprep").parts
@@ -48,7 +48,7 @@ def rooms() -> dict[str, int]:
 
 
 def main() -> int:
-    """Compare; print what is over its budget or lacks one."""
+    """Print each room that is over its budget or has none; return the exit code."""
     told = (TOP / "CONTRIBUTING.md").read_text()
     budgets = {room: int(number.replace(",", "")) for room, number in _ENTRY.findall(told)}
     counts, wrong = rooms(), 0

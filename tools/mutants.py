@@ -1,17 +1,16 @@
-"""Change one operator or number at a time and see whether the tests notice.
+"""Change one operator or number at a time and check whether the tests notice.
 
     python tools/mutants.py --budget 1500 --seed 0          # what `make mutants` does
     python tools/mutants.py --budget 300 normalize sample   # some modules alone
 
-Each change (a mutant) is given to the tests of its module. These are collected
-and run once, and then each mutant is put into the functions of a process forked
-from there, so that it costs what its tests take. A module that Numba compiles is
-changed in a copy of the tree instead, and imported anew for each mutant. Mutants
-are drawn by the seed; each module gets the same share of the budget [s of wall
-clock]. A mutant is caught if a test fails, or runs ten times as long as without
-it. Constants of a module are changed only where Numba compiles it. Those that
-survive are printed: each is a test that is missing, or a change that makes no
-difference.
+The tests of a module run on each change (a mutant). They are collected and run
+once. Each mutant is then put into the functions of a process forked from this
+one, so that it costs only the time of its tests. A module that Numba compiles is
+instead changed in a copy of the tree, and imported again for each mutant. Only
+such modules have their constants changed. Mutants are drawn by the seed; each
+module gets the same share of the budget [s of wall clock]. A mutant is caught if
+a test fails, or runs ten times as long as without it. Surviving mutants are
+printed: each shows a missing test, or a change that makes no difference.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ TESTS = {
     "store/runs": ["store/test_runs.py"],
     "store/writer": ["store/test_runs.py", "store/test_writer.py"],
 }
-"""Modules of the package, and the tests that are to catch what is wrong in them."""
+"""Modules of the package, and the tests that must catch errors in them."""
 
 LIBRARIES = ("numpy", "scipy.spatial", "scipy.ndimage", "numba", "h5py", "zarr", "pydantic",
              "orjson", "click", "rich", "hypothesis", "pytest")  # fmt: skip
@@ -83,7 +82,7 @@ SWAPS = {
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: where it is, and the module's text with it."""
+    """One change: its place, and the text of the changed module."""
 
     module: str
     line: int
@@ -92,7 +91,7 @@ class Mutant:
 
 
 def main() -> None:
-    """Read the command line, run, and print the score."""
+    """Read the command line, test the mutants, and print the score."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("modules", nargs="*", metavar="MODULE", help=", ".join(TESTS))
     parser.add_argument("--budget", type=float, default=1500.0, help="seconds of wall clock")
@@ -101,7 +100,7 @@ def main() -> None:
     for unknown in sorted(set(arguments.modules) - set(TESTS)):
         parser.error(f"{unknown}: is none of the modules {', '.join(TESTS)}")
     end = time.monotonic() + arguments.budget
-    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take longer than most tests
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # loading takes longer than most tests
     for library in LIBRARIES:
         __import__(library)
     folder = Path(tempfile.mkdtemp(prefix="mutants-"))
@@ -120,7 +119,7 @@ def main() -> None:
 def measure(
     folder: Path, modules: dict[str, list[str]], seed: int, end: float
 ) -> dict[str, dict[str, int]]:
-    """Return by module how many mutants there are, were tried and were caught."""
+    """Return by module the number of mutants that exist, were tried and were caught."""
     order, score = random.Random(seed), {}
     for left, (module, tests) in zip(range(len(modules), 0, -1), modules.items(), strict=True):
         text = (folder / "slatprep" / f"{module}.py").read_text("utf-8")
@@ -144,7 +143,8 @@ def measure(
 def lines_in_functions(text: str) -> set[int]:
     """Return the lines of a module that are part of a function.
 
-    A constant that others have imported by name cannot be changed in a process that runs.
+    Other lines hold constants. A running process cannot change a constant that other modules have
+    imported by name.
     """
     functions = (n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef))
     return {line for n in functions for line in range(n.lineno, (n.end_lineno or n.lineno) + 1)}
@@ -153,7 +153,7 @@ def lines_in_functions(text: str) -> set[int]:
 def imported_anew(
     folder: Path, module: str, tests: list[str], queue: list[Mutant], until: float
 ) -> Iterator[bool]:
-    """Yield whether each mutant survives, written into the copy of the tree."""
+    """Yield whether each mutant survives if it is written into the copy of the tree."""
     begin = time.monotonic()
     if not passes(lambda: run_tests(folder, tests), limit=1200.0):
         raise SystemExit(f"{module}: its tests fail without any mutant; mend them first")
@@ -171,7 +171,7 @@ def imported_anew(
 def collected_once(
     folder: Path, module: str, tests: list[str], queue: list[Mutant], until: float
 ) -> list[bool]:
-    """Return whether each mutant survives, put into a process that has run its tests before."""
+    """Return whether each mutant survives if it is put into a process that has run its tests."""
     found = folder / "survived.json"
     found.unlink(missing_ok=True)
     trials = Trials(f"slatprep.{module.replace('/', '.')}", queue, until, found)
@@ -183,13 +183,13 @@ def collected_once(
 
 
 class Trials:
-    """A plugin of pytest that runs the tests, and then forks a process for each mutant."""
+    """A pytest plugin that runs the tests, and then forks a process for each mutant."""
 
     def __init__(self, module: str, queue: list[Mutant], until: float, found: Path) -> None:
         self.module, self.queue, self.until, self.found = module, queue, until, found
 
     def pytest_runtestloop(self, session: Any) -> bool:
-        """Run the tests unchanged, which makes what they share, and then with each mutant."""
+        """Run the tests unchanged, which sets up shared fixtures, and then with each mutant."""
         begin = time.monotonic()
         if not all_pass(session.items):
             session.testsfailed = 1
@@ -198,7 +198,7 @@ class Trials:
         text = Path(str(sys.modules[self.module].__file__)).read_text("utf-8")
         same = Mutant(self.module, 0, "nothing is changed", text)
         if not passes(lambda: self.trial(same, session.items), limit):
-            session.testsfailed = 1  # Then no mutant that is caught would say anything.
+            session.testsfailed = 1  # The tests fail unchanged, so catching a mutant means nothing.
             return True
         survived = []
         for mutant in self.queue:
@@ -209,7 +209,7 @@ class Trials:
         return True
 
     def trial(self, mutant: Mutant, items: list[Any]) -> None:
-        """Put a mutant into the module and run the tests; ends the process."""
+        """Put a mutant into the module, run the tests and end the process."""
         module = sys.modules[self.module]
         changed = {"__name__": self.module, "__file__": module.__file__,
                    "__package__": module.__package__}  # fmt: skip
@@ -222,23 +222,23 @@ class Trials:
 
 
 def all_pass(items: list[Any]) -> bool:
-    """Run collected tests, again if they have been run; stop at the first that fails."""
+    """Run collected tests, also if they ran before; stop at the first failure."""
     from _pytest.runner import runtestprotocol
 
     for item, following in zip(items, [*items[1:], items[0]], strict=True):
         item._initrequest()
-        # With an item to follow, fixtures of the session stay for the next process.
+        # An item that follows keeps the session's fixtures for the next process.
         if any(report.failed for report in runtestprotocol(item, nextitem=following, log=False)):
             return False
     return True
 
 
 def put_into(there: Any, changed: Any, owner: object) -> None:
-    """Give functions new code in place, wherever they are known; plain values a new value."""
+    """Replace the code of functions in place, for all their users, and the values of constants."""
     for name, new in dict(changed).items():
         old = there.get(name)
         if old is new:
-            continue  # what the module imports
+            continue  # imported by the module
         for inner in ("__func__", "__wrapped__", "fget", "func"):
             if hasattr(new, inner) and hasattr(old, inner):
                 if hasattr(old, "cache_clear"):
@@ -256,7 +256,7 @@ def put_into(there: Any, changed: Any, owner: object) -> None:
 
 
 def mutants_of(folder: Path, module: str) -> Iterator[Mutant]:
-    """Yield every change to a module; not to annotations, decorators and what errors say."""
+    """Yield every change to a module, except in annotations, decorators and error messages."""
     tree = ast.parse((folder / "slatprep" / f"{module}.py").read_text("utf-8"))
     for node in told_apart(tree):
         for changed in changes_of(node):
@@ -298,7 +298,7 @@ def changes_of(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def passes(run: Callable[[], None], limit: float) -> bool:
-    """Return whether a process forked from this one, in which `run` ends it, exits with 0."""
+    """Return whether a forked process that calls `run`, which must end it, exits with 0."""
     sys.stdout.flush()
     child = os.fork()
     if not child:
@@ -316,14 +316,14 @@ def passes(run: Callable[[], None], limit: float) -> bool:
 
 
 def run_tests(folder: Path, tests: list[str], plugins: list[object] | None = None) -> None:
-    """Run tests on the copy and end this process with pytest's exit code."""
+    """Run tests on the copy of the tree and end this process with pytest's exit code."""
     import pytest
 
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(nothing, stream)
     os.chdir(folder)
-    sys.dont_write_bytecode = True  # its key has whole seconds: two mutants might share one
+    sys.dont_write_bytecode = True  # its key has whole seconds, so two mutants could share it
     sys.path.insert(0, str(folder))
     os.environ.update(PYTHONPATH=str(folder), PYTHONDONTWRITEBYTECODE="1")
     options = ["-x", "-q", "-p", "no:cacheprovider"]

@@ -1,7 +1,7 @@
 """Run the tutorial as a notebook, and write it with its outputs: examples/tutorial.ipynb.
 
-Its text and code are those of docs/tutorial.md, which the tests run, so the two
-cannot say different things; the tests compare them. Pictures are made small.
+Its text and code come from docs/tutorial.md, which the tests run and compare with
+the notebook. Pictures are reduced in size.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tutorial.md"
 NOTEBOOK = ROOT / "examples" / "tutorial.ipynb"
 WIDTH = 1000
-"""Pixels of a picture."""
+"""Largest width of a picture, in pixels."""
 
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.M | re.S)
 _LINK = re.compile(r"\]\((?!https?:)([\w./#-]+)\)")
 
 
 def notebook(page: str) -> str:
-    """Return a page as a notebook: its Python as cells, its shell as cells of ``%%sh``."""
+    """Return a page as a notebook: Python as cells, shell commands as ``%%sh`` cells."""
     cells: list[dict[str, object]] = []
 
     def add(kind: str, text: str) -> None:
@@ -41,7 +41,7 @@ def notebook(page: str) -> str:
     for block in _BLOCK.finditer(page):
         add("markdown", _LINK.sub(r"](../docs/\1)", page[end : block.start()]))
         language, text = block.groups()
-        if language != "text":  # What is printed a notebook shows itself.
+        if language != "text":  # A notebook shows printed output itself.
             add("code", f"%%sh\n{text}" if language == "sh" else text)
         end = block.end()
     add("markdown", _LINK.sub(r"](../docs/\1)", page[end:]))
@@ -52,7 +52,7 @@ def notebook(page: str) -> str:
 
 
 def run(text: str, folder: Path) -> str:
-    """Return a notebook after it was run in a folder: what cells print, and their pictures."""
+    """Run a notebook in a folder; return it with the printed output and pictures of its cells."""
     import nbformat
     from nbclient import NotebookClient
 
@@ -77,7 +77,7 @@ def run(text: str, folder: Path) -> str:
 
 
 def small(picture: str) -> str:
-    """Return a PNG in base64, at most `WIDTH` wide and of 128 colours."""
+    """Return a base64 PNG reduced to at most `WIDTH` pixels of width and 128 colours."""
     from PIL import Image
 
     image = Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB")

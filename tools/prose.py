@@ -1,9 +1,8 @@
 """Measure the prose of README, docs, help texts and messages: `python tools/prose.py`.
 
-A sentence has at most 30 words, and the median one at most 14. Code blocks, tables, headings,
-pictures and equations do not count as sentences; a piece of inline code counts as one word. Design
-notes (docs/design) are for those who change the code: their sentences are held to the limit, their
-words to no budget.
+A sentence has at most 30 words, and the median sentence at most 14. Code blocks, tables, headings,
+pictures and equations do not count as sentences; a piece of inline code counts as one word. The
+sentences of design notes (docs/design) must keep the limit too, but their words have no budget.
 """
 
 from __future__ import annotations
@@ -19,15 +18,16 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 LONGEST, MEDIAN = 30, 14
 BUDGET = 18_900
-"""Words of README and docs, with their tables; without bars, design notes and made pages."""
+"""Largest number of words of README and docs with their tables, without design notes and
+generated pages."""
 
 MADE = {"benchmarks.md"}
 ENDS = r"(?:(?<=[.!?:;])|(?<=[.!?:;]\*\*))\s+(?=(?:\*\*)?[A-Z])"
-"""Where a sentence ends: also beside bold letters."""
+"""Pattern of the space between two sentences, also beside bold text."""
 
 
 def sentences_of(text: str) -> Iterator[str]:
-    """Yield the sentences of a Markdown text, inline code as one word."""
+    """Yield the sentences of a Markdown text, with inline code as one word."""
     text = re.sub(r"```.*?```|\$\$.*?\$\$", "", text, flags=re.S)
     lines = (line for line in text.splitlines() if not line.startswith(("|", "#", "!", "<")))
     text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", "\n".join(lines))
@@ -37,7 +37,7 @@ def sentences_of(text: str) -> Iterator[str]:
 
 
 def words_of(text: str) -> list[str]:
-    """Return the words of a text: what has a letter or a digit, unlike the bars of a table."""
+    """Return the words of a text; a word has a letter or a digit, unlike the bars of a table."""
     return [word for word in text.split() if re.search(r"\w", word)]
 
 
@@ -48,7 +48,7 @@ def pages() -> dict[str, str]:
 
 
 def messages() -> Iterator[tuple[str, str]]:
-    """Yield what the package says: help texts, and texts of raised errors and printed lines."""
+    """Yield the package's texts for users: help texts, error messages and printed lines."""
     for path in sorted((ROOT / "slatprep").rglob("*.py")):
         place = path.relative_to(ROOT).as_posix()
         tree = ast.parse(path.read_text("utf-8"))
@@ -56,7 +56,7 @@ def messages() -> Iterator[tuple[str, str]]:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and place.startswith(
                 "slatprep/cli/"
             ):
-                # Of the sections behind it, examples and the names of options are no sentences.
+                # Examples and the names of options in the sections below are not sentences.
                 text, *sections = re.split(r"\n(\w[\w ]*)\n-+\n", ast.get_docstring(node) or "")
                 helps = dict(zip(sections[::2], sections[1::2], strict=True))
                 entries = helps.get("Parameters", helps.get("Attributes", ""))
@@ -73,7 +73,7 @@ def messages() -> Iterator[tuple[str, str]]:
 
 
 def main() -> None:
-    """Print what is too long, and the counts; exit with 1 if something is."""
+    """Print findings and counts; exit with 1 if there are findings."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--all", action="store_true", help="print a line for each page")
     everything = parser.parse_args().all

@@ -22,7 +22,7 @@ def json_schemas() -> dict[str, dict[str, Any]]:
     for name, kind in KINDS.items():
         title = f"slatprep {name} record"
         schema = {"$schema": dialect, **adapter_of(kind).json_schema(), "title": title}
-        # Defaults may be tuples.
+        # The round trip turns tuples among the defaults into lists.
         schemas[f"{name}_record.schema.json"] = json.loads(json.dumps(schema))
     return schemas
 

@@ -1,6 +1,6 @@
-"""Hooks of the documentation site: pages from outside docs/, links between them, the API.
+"""Hook into the documentation site: add pages from outside docs/, fix links, list the API.
 
-Run by mkdocs (``hooks`` in mkdocs.yml) when `make docs` builds the site.
+mkdocs runs these functions (``hooks`` in mkdocs.yml) when `make docs` builds the site.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NEIGHBOURS = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changes.md",
 }
-"""Pages in the repository's root, and what the site calls them."""
+"""Pages in the repository's root, and their names on the site."""
 
 log = logging.getLogger("mkdocs.site")  # below mkdocs: a warning fails a strict build
 
@@ -36,7 +36,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that do not lie in docs/."""
+    """Add the pages from outside docs/."""
     for source, name in NEIGHBOURS.items():
         text = (ROOT / source).read_text("utf-8")
         files.append(File.generated(config, name, content=_from_root(text, source)))
@@ -47,7 +47,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Follow links out of docs/: to a page of the site, or to the name of a file."""
+    """Replace links out of docs/ by links to a page of the site, or by the name of a file."""
     home = (ROOT / "docs" / page.file.src_uri).parent
 
     def follow(match: re.Match[str]) -> str:
@@ -68,12 +68,12 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
 
 
 def on_page_content(content: str, **_: object) -> str:
-    """Write equations as MathML, which browsers draw by themselves."""
+    """Convert equations to MathML, which browsers draw themselves."""
 
     def draw(match: re.Match[str]) -> str:
         display, latex = match["open"] == "[", html.unescape(match["latex"])
         drawn = convert(latex, display="block" if display else "inline")
-        # On a narrow screen a long equation scrolls by itself.
+        # On a narrow screen, a long equation scrolls inside its own box.
         return f'<div style="overflow-x: auto">{drawn}</div>' if display else drawn
 
     opening = r'<(?P<tag>span|div) class="arithmatex">\\(?P<open>[(\[])'
@@ -82,7 +82,7 @@ def on_page_content(content: str, **_: object) -> str:
 
 
 def _from_root(text: str, source: str) -> str:
-    """Write a page of the root as if it lay in docs/."""
+    """Return a page of the root with links as if it were in docs/."""
 
     def move(match: re.Match[str]) -> str:
         target = match.group(1)
@@ -102,7 +102,7 @@ def _rooms() -> list[str]:
 
 
 def _face() -> str:
-    """Write the page of what ``import slatprep`` offers, each name with its summary."""
+    """Return the page of names that ``import slatprep`` offers, with their summaries."""
     lines = ["# slatprep", "", ast.get_docstring(ast.parse(_source("slatprep"))) or "", ""]
     lines += ["| name | |", "| --- | --- |"]
     for node in ast.parse((PACKAGE / "__init__.pyi").read_text("utf-8")).body:
@@ -123,7 +123,7 @@ def _source(module: str) -> str:
 
 
 def _definition(module: str, name: str) -> str:
-    """Return the module that defines what another one may only hand on."""
+    """Return the module that defines a name, even if `module` only re-exports it."""
     for node in ast.parse(_source(module)).body:
         if isinstance(node, ast.ImportFrom) and any(alias.name == name for alias in node.names):
             return _definition(str(node.module), name)
