@@ -302,7 +302,7 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
 
 
 def _counts(statuses: Mapping[str, int], aligned: int, failed: str = "not built") -> str:
-    """Return the line that counts assets; those that went in were aligned or taken over."""
+    """Return the line that counts assets by status; `ok` assets are aligned or taken over."""
     # Beside the verdicts, "failed" would read as a verdict, and "ok" as all other verdicts.
     taken_over = statuses["ok"] - aligned
     counts = {"aligned": aligned} | ({"taken over": taken_over} if taken_over else {})

@@ -41,14 +41,13 @@ def check_alignment(
 ) -> None:
     """Check whether the alignment of an asset of STORE is good, and draw it.
 
-    Its quality is computed from the stored arrays, and its labels are looked up
-    again. Each figure agrees with the stored figure if it differs by no more than
-    the tolerance. Changes are from a voxel's stored label to its new label.
-    A picture shows both sides before and after from three
-    directions, the error of every voxel, the candidates and the verdict.
-    --asset, --worst and --ambiguous may be combined. The exit code is 1 unless
-    all alignments are good and the store is consistent. Without STORE, the
-    store that `make align` built last under data/ is used.
+    Quality and labels are computed again from the stored arrays. Each figure
+    agrees with the stored figure if it differs by no more than the tolerance.
+    Changes are from a voxel's stored label to its new label. A picture shows both
+    sides before and after from three directions, the error of every voxel, the
+    candidates and the verdict. --asset, --worst and --ambiguous may be combined.
+    The exit code is 1 unless all alignments are good and the store is consistent.
+    Without STORE, the store that `make align` built last under data/ is used.
 
     Parameters
     ----------

@@ -43,8 +43,8 @@ def evaluate(
     has properties (N,3) in normalised space, and may have material (N,) or
     logits (N,8), coords (N,3), and ranges (3,2) if they differ from the
     store's. Errors are means over valid voxels, then over objects. An asset
-    of the split with a bad prediction, or none, is named and left out, and
-    the exit code is 1. Predictions beside the run.json of a training take
+    of the split with a bad prediction, or without one, is named and omitted;
+    the exit code is then 1. Predictions beside the run.json of a training take
     the split of the run, unless --split-by or --shares is given.
 
     Parameters

@@ -22,7 +22,7 @@ Standardised = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
-    """TRELLIS's model, and where it runs.
+    """TRELLIS's model and its device.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class ModelOptions:
     revision : COMMIT
         Revision of the model. [default: newest]
     device
-        Where to run it. [default: the GPU if there is one]
+        Device that runs the model. [default: the GPU if there is one]
     """
 
     model: str = "microsoft/TRELLIS-image-large"

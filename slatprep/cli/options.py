@@ -37,7 +37,7 @@ class FiniteRange(click.FloatRange):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Return the number; `click.BadParameter` if it is none of the range."""
+        """Return the number; raise `click.BadParameter` if it is outside the range."""
         number: float = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is no finite number", param, ctx)
@@ -48,7 +48,7 @@ class Whole(click.IntRange):
     """A range of whole numbers of at most 32 bits, which fit every function that takes them."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the number; `click.BadParameter` if it is none of the range."""
+        """Return the number; raise `click.BadParameter` if it is outside the range."""
         number: int = super().convert(value, param, ctx)
         if number >= 2**32:
             self.fail(f"{value} is above {2**32 - 1}", param, ctx)

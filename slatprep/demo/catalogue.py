@@ -311,7 +311,7 @@ def snowman(rng: Rng, variant: int) -> DemoObject:
 
 
 def jello(rng: Rng, variant: int) -> DemoObject:
-    """Return a jello block on a plate; every second one has a cherry and a spoon."""
+    """Return a jello block on a plate; every second block has a cherry and a spoon."""
     flesh, plate = draw(rng, "jello"), draw(rng, "ceramic")
     side, height = rng.uniform(0.27, 0.33), rng.uniform(0.16, 0.22)
     parts = made_of(plate, vessel(0.0, 0.12, 0.4, 0.62, 0.06, floor=0.06))
@@ -342,7 +342,7 @@ def rocks(rng: Rng, variant: int) -> DemoObject:
 
 
 def water(rng: Rng, variant: int) -> DemoObject:
-    """Return a glass of water; every second one has a straw and a lemon."""
+    """Return a glass of water; every second glass has a straw and a lemon."""
     glass, wet = draw(rng, "glass"), draw(rng, "water")
     foot, rim, h = rng.uniform(0.22, 0.27), rng.uniform(0.3, 0.36), rng.uniform(0.8, 0.95)
     wall = 0.045

@@ -133,7 +133,7 @@ def rows_chosen(
 ) -> list[int]:
     """Return the rows of assets with these verdicts and categories; empty takes all.
 
-    ConfigError if there is no such verdict, or no asset has such a category.
+    Raises ConfigError if a verdict does not exist, or no asset has one of the categories.
     """
     categories, wanted = words_of(categories), store.with_verdicts(verdicts)
     known = sorted(set(map(str, store.column("category"))))

@@ -177,7 +177,7 @@ def store_statistics(
     store : Store, str or Place
         An open store, or its path or URL.
     verdicts, categories : str or collection of str
-        Take only assets with one of these; empty takes all.
+        Verdicts and categories of the assets to take; empty takes all.
     weight : str
         ``voxel``: each voxel has weight 1. ``asset``: the occupied voxels of a
         field have weight 1 together, and so have the voxels of a SLAT.
@@ -196,7 +196,7 @@ def store_statistics(
     Raises
     ------
     ConfigError
-        If there is no such `weight` or verdict, or no asset has such a category.
+        If `weight` or a verdict does not exist, or no asset has one of the categories.
     StoreError
         If the store cannot be read.
     """
