@@ -25,13 +25,16 @@ TRELLIS_ENCODER = "dinov2_vitl14_reg_slat_enc_swin8_B_64l8_fp16"
 """The encoder that TRELLIS's published configurations name as ``latent_model``."""
 
 COLUMNS = (
-    "object_id", "view", "category", "verdict", "fitness", "fitness_backward", "inlier_rmse",
-    "ambiguity", "valid_share",
+    "object_id", "view", "category", "verdict", "confidence", "expected_accuracy", "fitness",
+    "fitness_backward", "inlier_rmse", "ambiguity", "valid_share",
 )  # fmt: skip
 """The columns of ``asset/*`` in every export."""
 
-TARGETS = ("properties", "material", "valid")
-"""The arrays that a decoder is trained to predict."""
+TARGETS = ("properties", "material", "valid", "confidence")
+"""The arrays that a decoder is trained with, beside the latents."""
+
+ROWS = ("coords", "feats", *TARGETS, "distance", "place")
+"""The arrays of ``voxel/*`` in every export that has them all."""
 
 
 class Exported(NamedTuple):

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from slatprep.export.formats import Exported, ExportOptions, Writer, describe_columns
+from slatprep.export.formats import ROWS, Exported, ExportOptions, Writer, describe_columns
 from slatprep.export.target import FORMAT
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
@@ -17,8 +17,7 @@ from slatprep.store.layout import LAYOUTS, MERGED_COLUMNS
 if TYPE_CHECKING:
     import h5py
 
-_DATASETS = ("coords", "feats", "properties", "properties_si", "material", "valid", "distance",
-             "place", "transform", *MERGED_COLUMNS)  # fmt: skip
+_DATASETS = (*ROWS, "properties_si", "transform", *MERGED_COLUMNS)
 
 
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:

@@ -24,6 +24,7 @@ import orjson
 
 from slatprep.errors import ConfigError
 from slatprep.export.formats import (
+    ROWS,
     TARGETS,
     Exported,
     ExportOptions,
@@ -94,10 +95,12 @@ def write_metadata(model: str, directory: Path, entries: Sequence[dict[str, Any]
     """
     with (directory / METADATA).open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow(("sha256", "aesthetic_score", "num_voxels", f"latent_{model}"))
+        more = ("confidence", "expected_accuracy")
+        table.writerow(("sha256", "aesthetic_score", "num_voxels", f"latent_{model}", *more))
         for entry in entries:
             stem = PurePosixPath(entry["file"]).name.removesuffix(".npz")
-            table.writerow((stem, "inf", entry["points"], True))
+            told = (entry[name] for name in more)
+            table.writerow((stem, "inf", entry["points"], True, *told))
     return [METADATA]
 
 
@@ -131,7 +134,7 @@ def write_shard(directory: Path, number: int, assets: Iterable[StoredAsset]) -> 
             key = file_name(asset.asset_id, dots=False)
             about = {**describe_columns(asset), "transform": asset.transform.tolist()}
             _add(tar, f"{key}.json", orjson.dumps(about))
-            arrays = _arrays(asset, "coords", "feats", *TARGETS, "distance", "place")
+            arrays = _arrays(asset, *ROWS)
             # Not compressed, since a training loop reads it repeatedly.
             packed = io.BytesIO()
             np.savez(packed, **arrays)

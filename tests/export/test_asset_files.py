@@ -59,7 +59,9 @@ def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
     export_store(open_store(store), tmp_path / "root", "npz")
     for asset_id, asset in mixed.assets.items():
         with np.load(tmp_path / "root" / "latents" / ENCODER / f"{asset_id}.npz") as data:
-            assert sorted(data) == ["coords", "feats", "material", "properties", "valid"]
+            assert sorted(data) == [
+                "confidence", "coords", "feats", "material", "properties", "valid",
+            ]  # fmt: skip
             np.testing.assert_array_equal(data["coords"], asset.coords)
             np.testing.assert_array_equal(data["feats"], asset.feats)
             assert data["coords"].dtype == np.uint8 and data["feats"].dtype == np.float32

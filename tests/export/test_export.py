@@ -37,7 +37,7 @@ KINDS = ("hdf5", "npz")
 
 
 def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
-    out = tmp_path / "all.h5"
+    out, stored = tmp_path / "all.h5", open_store(store)
     export_store(store, out, "hdf5")
     with h5py.File(out) as file:
         assert sorted(file) == sorted(mixed.assets)
@@ -48,6 +48,10 @@ def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
             np.testing.assert_array_equal(group["coords"][:], asset.coords)
             np.testing.assert_array_equal(group["feats"][:], asset.feats)
             np.testing.assert_allclose(group["transform"][:], QUARTER_TURN, atol=2e-3)
+            own = stored.asset(asset_id)
+            np.testing.assert_array_equal(group["confidence"][:], own.confidence)
+            for name in ("confidence", "expected_accuracy"):
+                assert group.attrs[name] == own.columns[name]
             assert group["valid"][:].all() and (group["distance"][:] < 0.01).all()
             assert list(group["properties_si"].attrs["units"]) == ["Pa", "kg/m^3", "1"]
             assert group["distance"].attrs["units"] == "voxel"
@@ -74,7 +78,7 @@ def samples_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_shards_are_read_by_webdataset(store, mixed, tmp_path):
-    out = tmp_path / "shards"
+    out, stored = tmp_path / "shards", open_store(store)
     export_store(store, out, "webdataset", options=ExportOptions(shard_size=2))
     assert len(list(out.glob("*.tar"))) == 3
     samples = samples_of(out)
@@ -84,6 +88,9 @@ def test_shards_are_read_by_webdataset(store, mixed, tmp_path):
         arrays = sample["npz"]
         np.testing.assert_array_equal(arrays["coords"], asset.coords)
         np.testing.assert_array_equal(arrays["feats"], asset.feats)
+        own = stored.asset(sample["json"]["asset_id"])
+        np.testing.assert_array_equal(arrays["confidence"], own.confidence)
+        assert sample["json"]["expected_accuracy"] == own.columns["expected_accuracy"]
         assert arrays["properties"].shape == (len(asset.coords), 3)
         assert set(np.unique(arrays["material"])) == {JELLY[0], METAL[0]}
         np.testing.assert_allclose(sample["json"]["transform"], QUARTER_TURN, atol=2e-3)
