@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import nan
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +32,16 @@ from slatprep.align.figures import measure_figures
 from slatprep.align.finish import as_free, finish, rank_of
 from slatprep.align.ground import GROUND_GAIN, LEAST_ABOVE, RAISED, find_layers, gain, raised
 from slatprep.align.mirror import mirror_gain
-from slatprep.align.pair import COARSE_SAMPLES, COARSE_TAUS, MOST_SURVIVORS, TIE, Pair
+from slatprep.align.pair import (
+    COARSE_SAMPLES,
+    COARSE_TAUS,
+    DISTINCT,
+    MOST_SURVIVORS,
+    POLISH_SAMPLES,
+    POLISH_TAUS,
+    TIE,
+    Pair,
+)
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.quality import compare
 from slatprep.align.search import ranked, search_all
@@ -198,6 +207,26 @@ def fitted_near(
     fit = Deformed(own, alignment.model, alignment.deformation, figures, Warp.unbent(own))
     before, after = (rank_of(free.pose, free.figures) for free in as_free(pair, [fit, deformed]))
     return Placement(best.similarity.transform, best.score, 0.0), after - before
+
+
+def lead_of_another(
+    transform: NDArray[np.float64],
+    field: MaterialField,
+    latents: StructuredLatents,
+    parameters: AlignParameters,
+) -> float:
+    """Return by how much another placement scores above a given one; -inf if none fits well.
+
+    The given one may be off by `DISTINCT` at most, as both are polished.
+    """
+    pair = _pair_of(field, latents, parameters)
+    given = Pose(Similarity.of(transform))
+    own = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
+    if pair.apart(own, given)[0] >= DISTINCT:
+        own = pair.refine([given], POLISH_SAMPLES, (), 0.0)
+    others = pair.others(given, _search(pair).poses)
+    well = [pose.score for pose in others if pose.score > POOR]
+    return max(well, default=-inf) - own[0].score
 
 
 def _figures(pair: Pair, best: Pose, deformed: Deformed, clear_by: float = nan) -> FitFigures:

@@ -1,13 +1,18 @@
-"""Take a known frame without a search.
+"""Take a known frame.
 
 The transform is the source's, or the identity if the source states none. Quality, confidence and
-verdict are measured as for any engine, so a wrong frame shows.
+verdict are measured as for any engine. The default engine's search serves as a check: if it finds a
+placement that fits clearly better, the margin is negative.
 """
 
 from __future__ import annotations
 
+from math import nan
+
 import numpy as np
 
+from slatprep.align.field import lead_of_another
+from slatprep.align.pair import TIE
 from slatprep.align.quality import measure_quality
 from slatprep.geometry.frames import split_transform
 from slatprep.parameters import AlignParameters
@@ -20,10 +25,13 @@ def align(
     """Take the frame that the field states; see `slatprep.align.align`."""
     transform = np.eye(4) if field.frame is None else field.frame
     _, _, scale = split_transform(transform)
+    lead = lead_of_another(transform, field, latents, parameters)
     return Alignment(
         transform=transform,
         engine=Engine.KNOWN,
         model=Model.RIGID if abs(scale - 1.0) < 1e-6 else Model.SIMILARITY,
         search=Search.NONE,
         quality=measure_quality(field, latents, transform, parameters.radius),
+        # Placements that fit as well do not count: the source says which of them is right.
+        margin=-lead if lead > TIE else nan,
     )

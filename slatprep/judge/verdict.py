@@ -103,12 +103,17 @@ def judge(
     """
     from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT
     from slatprep.judge.confidence import class_confidence
-    from slatprep.judge.evidence import evidence_of, surroundings_of
+    from slatprep.judge.evidence import FIGURES, evidence_of, surroundings_of
 
     ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters)
     around = surroundings_of(field, latents, alignment, annotation)
     evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
     same, placed = (float(one.probability(evidence)) for one in (SAME_OBJECT, PLACEMENT))
+    if alignment.margin < 0.0:
+        # A stated frame is right as often as the placement that leads it by so much is wrong.
+        of_other = evidence.copy()
+        of_other[FIGURES.index("margin")] = -alignment.margin
+        placed = 1.0 - float(PLACEMENT.probability(of_other))
     by = alignment.settled_by
     if by is not None and ambiguity.material_share > THRESHOLDS.good_ambiguity:
         # So far `placed` is the probability that any of the ties is right; `by` chose one of them.
@@ -219,6 +224,11 @@ def verdict_of(
         reasons.append(
             f"{others} about as well and would change the class of {ambiguity:.1%} of the "
             f"voxels (good needs {limits.good_ambiguity:.0%})"
+        )
+    if alignment.margin < 0.0:
+        reasons.append(
+            f"another placement fits better than the stated frame, by {-alignment.margin:.3f} in "
+            "score: check its direction, its order of axes, and that it is for column vectors"
         )
     mirrored = math.nan if alignment.figures is None else alignment.figures.mirrored
     # A mirror image of another object cannot be recognised.

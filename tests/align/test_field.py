@@ -346,3 +346,27 @@ def test_an_engine_that_is_not_installed_names_its_extra(monkeypatch, engine, ex
     ):
         with pytest.raises(SlatprepError, match=rf"{engine}.*slatprep\[{extra}\]"):
             call()
+
+
+def test_a_stated_frame_is_held_against_the_placement_that_fits_best():
+    # A block and its half-turn differ by a knob alone.
+    occupancy = np.zeros((64,) * 3, dtype=bool)
+    occupancy[16:48, 20:44, 24:40] = occupancy[36:44, 24:32, 40:48] = True
+    latents, parameters = surface_latents(occupancy), AlignParameters(engine="known")
+    classes = np.where(GRID[..., 0] < 32, 1, 2)
+    half_turn, bit_off = (
+        np.diag([-1.0, -1.0, 1.0, 1.0]),
+        make_transform(np.eye(3), np.full(3, 0.01)),
+    )
+    found = []
+    for frame in (np.eye(4), bit_off, half_turn):
+        field = replace(field_of(occupancy, classes), frame=frame)
+        alignment = align(field, latents, parameters)
+        np.testing.assert_array_equal(alignment.transform, frame)
+        found.append((alignment, judged(field, latents, alignment)))
+    for alignment, judgement in found[:2]:
+        assert np.isnan(alignment.margin) and judgement.right_placement > 0.9
+    wrong, judgement = found[2]
+    assert wrong.quality.fitness > 0.8 and wrong.margin < -TIE
+    assert judgement.verdict is Verdict.FAILED and judgement.right_placement < 0.1
+    assert "another placement fits better than the stated frame" in " ".join(judgement.reasons)

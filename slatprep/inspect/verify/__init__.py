@@ -61,6 +61,9 @@ _NUMBERS = {
 }
 """Largest allowed number of a column; the smallest is 0."""
 
+_LEAST_MARGIN = -1.0
+"""Smallest margin: that of a stated frame that another placement beats."""
+
 _TOLERANCE = 1e-6
 """Largest allowed difference of a rotation's determinant from 1, due to rounding."""
 
@@ -217,11 +220,14 @@ def index_findings(store: Store) -> Iterator[Finding]:
                 yield Finding(f"asset/{name}", asset_id, f"is {text!r}", expected)
     for name, most in _NUMBERS.items():
         values = store.column(name)
-        fine = (values >= 0) & (values <= most)
+        least = _LEAST_MARGIN if name == "margin" else 0.0
+        fine = (values >= least) & (values <= most)
         if name in DISTANCES:
             fine |= np.isnan(values)
         for wrong in np.flatnonzero(~fine):
-            yield Finding(f"asset/{name}", ids[wrong], f"is {values[wrong]}", f"0 to {most:g}")
+            yield Finding(
+                f"asset/{name}", ids[wrong], f"is {values[wrong]}", f"{least:g} to {most:g}"
+            )
     yield from _transform_findings(store)
 
 
