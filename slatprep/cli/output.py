@@ -54,8 +54,8 @@ class Output:
     """Printer of one command's results, as tables or JSON.
 
     With `as_json`, standard output is one JSON document instead of tables. `verbosity` -1 prints
-    only errors and results, 1 prints more details. If the command is stopped, `if_stopped` is
-    printed: what is kept, and how to go on.
+    only problems, and results that go to no file; 1 prints more details. If the command is
+    stopped, `if_stopped` is printed: what is kept, and how to go on.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
@@ -189,7 +189,9 @@ def say(text: object = "", *, err: bool = False, nl: bool = True) -> None:
 
 OUTPUT_OPTIONS = (
     click.Option(["--json", "as_json"], is_flag=True, help="Print JSON instead of tables."),
-    click.Option(["-q", "--quiet"], is_flag=True, help="Print only errors and results."),
+    click.Option(
+        ["-q", "--quiet"], is_flag=True, help="Print only problems, and results that go to no file."
+    ),
     click.Option(["-v", "--verbose"], is_flag=True, help="Print more details."),
 )
 """Options of every command; the command's runner reads them."""

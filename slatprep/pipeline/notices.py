@@ -14,7 +14,7 @@ from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.rows import NextStore, moments_of, slat_contents
-from slatprep.readers.contents import in_words, look_standardised, pooled_moments
+from slatprep.readers.contents import in_words, look_standardised, pooled_moments, tell_alone
 from slatprep.readers.joins import explain_unmatched
 from slatprep.readers.plausible import ENOUGH
 from slatprep.readers.values import guess_in
@@ -217,7 +217,7 @@ def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
     looks = {
         row.asset_id: look_standardised(own, latents)
         for row, own in known
-        if row.n_voxels >= ENOUGH
+        if row.n_voxels >= ENOUGH and tell_alone(own, latents)
     }
     if latents.standardised and standardised == "auto":
         pooled = pooled_moments([(row.n_voxels, own) for row, own in known])
@@ -229,6 +229,6 @@ def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
     if others and standardised != "no":
         how = "as the encoder gives them" if latents.standardised else "standardised already"
         yield (
-            f"the latents of {len(others)} of {len(looks)} assets look {how}, unlike the others "
-            f"({', '.join(others[:3])}): look where they come from"
+            f"the latents of {_of_assets(others, new.ids)} look {how}, unlike the others: look "
+            "where they come from"
         )

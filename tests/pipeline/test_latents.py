@@ -86,9 +86,27 @@ def test_one_asset_unlike_the_others_is_named(dataset, tmp_path):
     dataset.write_slat("c.npz", asset.coords, (asset.feats - MEAN) / STD)
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     (warning,) = of_latents(summary.warnings)
-    assert "1 of 6 assets look standardised already, unlike the others (c)" in warning
+    assert "1 of 6 assets (c) look standardised already, unlike the others" in warning
     records = records_of(summary.records)
     assert [name for name, record in records.items() if record["warnings"]] == ["c"]
+
+
+def test_mixed_latents_are_counted_and_an_asset_of_little_spread_is_not_among_them(
+    make_dataset, tmp_path
+):
+    def unlike(names: str, raw: str, spread: dict[str, float]) -> str:
+        dataset = make_dataset(*names)
+        for name, asset in dataset.assets.items():
+            standard = (asset.feats - MEAN) / STD * np.float32(spread.get(name, 1.0))
+            dataset.write_slat(
+                f"{name}.npz", asset.coords, asset.feats if name in raw else standard
+            )
+        told = build_store(dataset.parameters(), tmp_path / f"{names}.zarr").warnings
+        return next(text for text in told if "unlike the others" in text)
+
+    assert "4 of 9 assets (f, g, h and 1 more) look standard" in unlike("abcdefghi", "abcde", {})
+    said = unlike("abcdef", "f", {"b": 0.4})
+    assert "1 of 9 assets (f) look as the encoder gives them" in said
 
 
 def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path):
