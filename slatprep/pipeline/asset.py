@@ -26,7 +26,7 @@ from slatprep.align import align
 from slatprep.align.deform import deform_if_earned
 from slatprep.align.pose import Similarity
 from slatprep.align.surface import surface_of
-from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
+from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError, in_unicode
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.kernel import KEPT
@@ -149,14 +149,14 @@ def _resumed(planned: PlannedAsset, spool: Spool) -> Row | None:
 
 def _why(error: Exception) -> tuple[str, str, StatusOfFailed]:
     """Return a failure's reason in one line, the traceback of an internal error, the status."""
-    line, trace = " ".join(str(error).split()), ""
+    line, trace = in_unicode(" ".join(str(error).split())), ""
     if len(line) > _REASON:
         line = f"{line[:_REASON]} ..."
     if isinstance(error, MemoryError):
         line = f"memory ran out ({line or 'no more could be had'}); run with fewer jobs"
     elif not isinstance(error, SlatprepError):
         line = f"internal error, please report: {type(error).__name__}: {line}"
-        trace = traceback.format_exc()[-_TRACEBACK:]
+        trace = in_unicode(traceback.format_exc())[-_TRACEBACK:]
     missing = isinstance(error, MissingPartnerError)
     return line, trace, Status.SKIPPED if missing else Status.FAILED
 

@@ -17,6 +17,7 @@ import orjson
 
 from slatprep import records
 from slatprep.errors import InputError, SlatprepError
+from slatprep.geometry.frames import split_transform
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.values import require_plausible
@@ -166,7 +167,10 @@ class ForeignSource(_Foreign):
             for one, values in zip(table, field.properties.T, strict=True):
                 self._require(one.physical(values).all(), f"values that are not {one.allowed}")
             frame = np.eye(4) if field.frame is None else np.asarray(field.frame, np.float64)
-            self._require(frame.shape == (4, 4) and np.isfinite(frame).all(), "a frame of NaN")
+            try:
+                split_transform(frame)
+            except ValueError as error:
+                raise self._fault(f"gives a frame that is refused: {error}") from None
             self._require(_is_count(field.unphysical), f"{field.unphysical!r} unphysical voxels")
             orjson.dumps(field.bounds)
             self._require_told(field)

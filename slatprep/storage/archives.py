@@ -92,8 +92,8 @@ class Archive:
     @property
     def folder(self) -> Path:
         """Folder of the cache for the archive in this state."""
-        state = [self.stamp, *(self.wanted if self.packed else ())]
-        return self.home / short(" ".join(state))
+        own = f"-{short(' '.join(self.wanted))}" if self.packed else ""
+        return self.home / f"{short(self.stamp)}{own}"
 
     @property
     def home(self) -> Path:
@@ -174,7 +174,7 @@ class Archive:
         return data if len(data) == entry.size else None
 
     def _file(self, entry: Entry) -> Path:
-        return self.folder / f"{short(entry.link or entry.name)}.z"
+        return self.folder / f"{entry.offset}.z"  # A name may occur twice; links share an offset.
 
     def index(self, progress: Callable[[int], None] = lambda _: None) -> Index:
         """Return the index of the archive, from the cache or by reading the headers.
@@ -226,9 +226,7 @@ class Index:
             target = self.members.get(entry.link)
             problem = "" if target else f"is a link to {entry.link!r}, which is not before it"
             target = target or entry
-            link = target.link or entry.link
-            problem = problem or target.problem
-            entry = target._replace(name=entry.name, link=link, problem=problem)
+            entry = target._replace(name=entry.name, problem=problem or target.problem)
         self.twice += entry.name in self.members
         self.members[entry.name] = entry
 
@@ -262,7 +260,7 @@ def _extend(
         if index.complete or not archive.packed:
             _write_index(archive, index)
     for older in archive.home.iterdir():
-        if older != archive.folder:
+        if not older.name.startswith(archive.folder.name.partition("-")[0]):
             shutil.rmtree(older, ignore_errors=True)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from datetime import timedelta
-from functools import cache
+from functools import cache, lru_cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -17,6 +17,8 @@ ReadRange = Callable[[str, int, int], bytes]
 """Function that reads a key from a start offset up to, without, an end offset."""
 
 _forked_from_user = False
+
+_CREDENTIALS = "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN"
 
 
 def range_reader(bucket: str) -> ReadRange | None:
@@ -27,13 +29,15 @@ def range_reader(bucket: str) -> ReadRange | None:
     ``AWS_ENDPOINT_URL_S3``. ``AWS_PROFILE`` or ``SLATPREP_OBSTORE=no`` turns it off. The reader
     raises FileNotFoundError, PermissionError or OSError.
     """
-    known = os.environ.get("AWS_ACCESS_KEY_ID") and os.environ.get("AWS_SECRET_ACCESS_KEY")
+    credentials = tuple(map(os.environ.get, _CREDENTIALS))
+    known = all(credentials[:2])
     region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
     allowed = os.environ.get("SLATPREP_OBSTORE") != "no" and "AWS_PROFILE" not in os.environ
     if not (allowed and known and (region or endpoint)) or _forked_from_user or not _available():
         return None
-    return _reader(bucket, region or "us-east-1", endpoint or "", os.getpid())
+    # A store keeps the credentials with which it was opened; they may be renewed meanwhile.
+    return _reader(bucket, region or "us-east-1", endpoint or "", credentials, os.getpid())
 
 
 @cache
@@ -44,8 +48,10 @@ def _available() -> bool:
     return find_spec("obstore") is not None and not fsspec.config.conf.get("s3")
 
 
-@cache
-def _reader(bucket: str, region: str, endpoint: str, _process: int) -> ReadRange:
+@lru_cache(maxsize=64)
+def _reader(
+    bucket: str, region: str, endpoint: str, _credentials: tuple[str | None, ...], _process: int
+) -> ReadRange:
     from obstore import get_range
     from obstore.exceptions import BaseError, NotFoundError, PermissionDeniedError
     from obstore.store import S3Store

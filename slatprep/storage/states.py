@@ -81,7 +81,10 @@ class States:
             return None
         if found.mount not in self._counts:
             listed = _statx(file, _BASIC | _MOUNT)
-            mounts = Path("/proc/self/mountinfo").read_text(errors="replace")
+            try:
+                mounts = Path("/proc/self/mountinfo").read_text(errors="replace")
+            except OSError:  # Not every sandbox has /proc.
+                mounts = ""
             self._counts[found.mount] = listed is not None and keeps_times(mounts, listed.mount)
         return found if self._counts[found.mount] else None
 

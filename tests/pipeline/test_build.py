@@ -50,12 +50,12 @@ def test_strict_stops_at_the_first(make_dataset, tmp_path):
 def test_an_error_of_our_own_is_marked_and_costs_one_asset(make_dataset, tmp_path, monkeypatch):
     def fails_for_b(step: str, name: str) -> None:
         if (step, name) == ("asset read", "b"):
-            raise ZeroDivisionError("division\nby zero")
+            raise ZeroDivisionError("division\nby zero in \udcff")
 
     inject(monkeypatch, fails_for_b)
     summary = build_store(make_dataset("a", "b").parameters(), tmp_path / "s.zarr")
     assert summary.statuses == {"ok": 1, "failed": 1, "skipped": 0}
-    reason = "internal error, please report: ZeroDivisionError: division by zero"
+    reason = "internal error, please report: ZeroDivisionError: division by zero in \\udcff"
     assert summary.problems == (("b", reason),)
     assert "fails_for_b" in records_of(summary.records)["b"]["traceback"]
 

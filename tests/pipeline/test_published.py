@@ -160,6 +160,37 @@ def test_object_in_two_archives_is_not_taken_from_either(objects, made, strange,
     assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[1]]
 
 
+@pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
+def test_a_link_holds_what_its_name_held_before_it(strange, suffix):
+    """As GNU tar unpacks them; Python's tarfile writes through the link."""
+    path = strange / f"tree{suffix}"
+    with tarfile.open(path, "w:gz" if suffix == ".tar.gz" else "w") as archive:
+        add(archive, "a/grid.npy", b"first")
+        link = tarfile.TarInfo("b/grid.npy")
+        link.type, link.linkname = tarfile.LNKTYPE, "a/grid.npy"
+        archive.addfile(link)
+        add(archive, "a/grid.npy", b"later")
+    made = Archive.on_disk(path, ("*/grid.npy",))
+    held = {name: made.read(entry) for name, entry in made.index().members.items()}
+    assert held == {"a/grid.npy": b"later", "b/grid.npy": b"first"}
+
+
+def test_builds_that_want_other_members_of_an_archive_leave_each_other_theirs(strange):
+    path = strange / "tree.tar.gz"
+
+    def of_all() -> dict[str, Archive]:
+        return {name: Archive.on_disk(path, (f"*/{name}",)) for name in ("grid.npy", "mask.npy")}
+
+    for content in (b"first", b"later"):
+        with tarfile.open(path, "w:gz") as archive:
+            for name in ("a/grid.npy", "a/mask.npy"):
+                add(archive, name, content)
+        one, other = of_all().values()
+        for each in (one, other):
+            each.index()
+        assert {one.folder, other.folder} == set(one.home.iterdir())  # none of an older state
+
+
 def truncated(data: bytes) -> bytes:
     return data[: len(data) * 2 // 3]
 

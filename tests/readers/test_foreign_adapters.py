@@ -57,6 +57,7 @@ BAD_FIELDS: dict[str, Change] = {
     "more unphysical voxels than numbers": lambda f: {"unphysical": 2**70},
     "unphysical voxels below 0": lambda f: {"unphysical": -1},
     "a frame of NaN": lambda f: {"frame": np.full((4, 4), np.nan)},
+    "a sheared frame": lambda f: {"frame": np.eye(4) + np.eye(4, k=1)},
 }
 BAD_SLATS: dict[str, Change] = {
     "nothing": lambda s: None,

@@ -66,6 +66,16 @@ def test_only_disks_that_are_listed_and_can_be_written_keep_times():
     assert not keeps_times("", 27)
 
 
+def test_without_proc_no_state_counts(on_a_disk, monkeypatch):
+    path = written(on_a_disk / "a")
+
+    def lacking(self: Path, **_: object) -> str:
+        raise FileNotFoundError(2, "No such file or directory", str(self))
+
+    monkeypatch.setattr(Path, "read_text", lacking)
+    assert States().of(str(path)) is None
+
+
 def test_a_state_is_what_the_system_says(on_a_disk):
     path = written(on_a_disk / "a")
     state, told = States().of(str(path)), path.stat()

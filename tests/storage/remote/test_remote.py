@@ -170,6 +170,15 @@ def test_a_forked_process_reads_by_s3fs(bucket, s3):
 
 
 @pytest.mark.usefixtures("obstore")
+@pytest.mark.parametrize("name", ["AWS_ACCESS_KEY_ID", "AWS_SESSION_TOKEN"])
+def test_credentials_that_were_renewed_are_taken(name, monkeypatch):
+    first = range_reader("bucket")
+    assert first is range_reader("bucket") is not None
+    monkeypatch.setenv(name, "renewed")
+    assert range_reader("bucket") not in (first, None)
+
+
+@pytest.mark.usefixtures("obstore")
 @pytest.mark.parametrize(
     ("name", "value"),
     [("AWS_SECRET_ACCESS_KEY", ""), ("AWS_PROFILE", "mine"), ("SLATPREP_OBSTORE", "no")],
