@@ -24,6 +24,7 @@ from slatprep.records import COLOURS, MATERIAL_CLASSES, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
+from slatprep.store.records import StoredRecords
 
 SCENE = "scene.usda"
 
@@ -70,12 +71,15 @@ def write(
     solid[:, 2] = np.minimum(solid[:, 2], MAX_POISSON)
     name = f"{file_name(asset.asset_id)}.usdc"
     binned = bin_materials(there.material, solid, materials)
-    width = size * _edge(asset, points)
-    _write_asset(directory / name, asset.asset_id, there.in_slat * size, width, solid, binned)
+    volumes = size**3 * _volumes(asset, points, there.in_slat)
+    width = float(np.cbrt(volumes.mean())) if len(volumes) else size / RESOLUTION
+    masses = solid[:, 1] * volumes
+    places = there.in_slat * size
+    _write_asset(directory / name, asset.asset_id, places, width, masses, solid, binned)
     figures = {
         "spacing": width,
         "materials": len(binned.material),
-        "kilograms": float(solid[:, 1].sum() * width**3),
+        "kilograms": float(masses.sum()),
         "E_error": binned.modulus_error,
         "nu_error": binned.ratio_error,
         "nu_clipped": clipped,
@@ -108,10 +112,14 @@ def _write_asset(
     asset_id: str,
     positions: NDArray[np.float64],
     width: float,
+    masses: NDArray[np.float64],
     solid: NDArray[np.float64],
     binned: Binned,
 ) -> None:
-    """Write an asset: points (N, 3) [m] of cubes `width` [m] wide, E, density, nu (N, 3)."""
+    """Write an asset: points (N, 3) about `width` wide [m], masses (N,) [kg], `solid` (N, 3).
+
+    The columns of `solid` are E [Pa], density [kg/m^3] and nu.
+    """
     geom, sdf, vt, shade = _pxr("UsdGeom", "Sdf", "Vt", "UsdShade")
     stage, root = _stage(path, "/Asset")
     root.GetPrim().SetCustomDataByKey("slatprep:asset_id", asset_id)
@@ -129,9 +137,9 @@ def _write_asset(
         half = np.full(3, width / 2)
         extent = np.array([positions.min(axis=0) - half, positions.max(axis=0) + half])
         points.CreateExtentAttr(vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
-        masses = vt.FloatArray.FromNumpy((solid[:, 1] * width**3).astype(np.float32))
         kind = sdf.ValueTypeNames.FloatArray
-        prim.CreateAttribute("physics:masses", kind, custom=False).Set(masses)
+        written = vt.FloatArray.FromNumpy(masses.astype(np.float32))
+        prim.CreateAttribute("physics:masses", kind, custom=False).Set(written)
         colours = (COLOURS[binned.material[binned.rows]] / 255).astype(np.float32)
         shown = points.CreateDisplayColorPrimvar(geom.Tokens.vertex)
         shown.Set(vt.Vec3fArray.FromNumpy(colours))
@@ -205,12 +213,14 @@ def _stage(path: Path, name: str) -> tuple[Any, Any]:
     return stage, root
 
 
-def _edge(asset: StoredAsset, points: formats.Points) -> float:
-    """Return the edge in the SLAT's unit cube of a cube with the volume of a voxel."""
+def _volumes(
+    asset: StoredAsset, points: formats.Points, in_slat: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the volume (N,) of each point's voxel, in the SLAT's unit cube."""
     if points == "slat":
-        return 1.0 / asset.store.contents.latents.resolution
-    scale = float(np.cbrt(np.abs(np.linalg.det(asset.transform[:3, :3]))))
-    return scale / RESOLUTION
+        return np.full(len(in_slat), asset.store.contents.latents.resolution**-3.0)
+    place_map = StoredRecords(asset.store).place_map(asset)
+    return place_map.volume_ratios(in_slat) / RESOLUTION**3
 
 
 def _remarks(entries: Sequence[dict[str, Any]]) -> tuple[str, ...]:

@@ -54,6 +54,18 @@ class PlaceMap:
             return carried
         return undeform(self.deformation, carried)
 
+    def volume_ratios(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return by how much small volumes at points (N, 3) of the SLAT frame are larger there.
+
+        The ratio (N,) is that of a volume in the SLAT frame to the same in the PixieVerse frame.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        own = abs(float(np.linalg.det(self.transform[:3, :3])))
+        if self.deformation is None:
+            return np.full(len(points), own)
+        ratios: NDArray[np.float64] = own / abs(np.linalg.det(jacobian(self.deformation, points)))
+        return ratios
+
     def places(
         self, coords: NDArray[np.integer], resolution: int = RESOLUTION
     ) -> NDArray[np.float64]:

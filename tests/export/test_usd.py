@@ -16,8 +16,11 @@ from support.synthetic import JELLY, QUARTER_TURN, Dataset
 from slatprep.errors import ConfigError
 from slatprep.export import ExportOptions, export_store
 from slatprep.export.usd import bin_materials
+from slatprep.geometry.frames import voxel_centres
 from slatprep.pipeline.dataset import build_store
 from slatprep.records.yielding import MAX_POISSON, YIELDING
+from slatprep.store import open_store
+from slatprep.store.records import StoredRecords
 
 pytest.importorskip("pxr", reason="usd-core has no wheel for this machine")
 SIZE = 0.4
@@ -50,6 +53,32 @@ def solid_of(mixed: Dataset, asset_id: str) -> tuple[np.ndarray, np.ndarray]:
     voxels = np.argwhere(grid[..., 3] != 7)
     centres = ((voxels + 0.5) / 64 - 0.5) @ QUARTER_TURN[:3, :3].T
     return centres, grid[tuple(voxels.T)]
+
+
+def test_masses_of_a_bent_object_are_those_of_its_bent_voxels(deformed_build, tmp_path):
+    from pxr import Usd, UsdGeom
+
+    store, out, uneven = open_store(deformed_build.store), tmp_path / "usd", list[float]()
+    export_store(store.path, out, format="usd", verdicts="all", options=ExportOptions(size=SIZE))
+    for entry in index_of(out):
+        asset = store.asset(entry["asset_id"])
+        stage = Usd.Stage.Open(str(out / entry["file"]))
+        points = UsdGeom.Points(stage.GetPrimAtPath("/Asset/Points"))
+        mass = np.array(points.GetPrim().GetAttribute("physics:masses").Get())
+        # How large each voxel is in the SLAT frame: by where its neighbourhood goes, both ways.
+        carried, step = StoredRecords(store).place_map(asset), 1e-4
+        centres = voxel_centres(asset.field.voxels)
+        slopes = [
+            (carried.to_slat(centres + step * axis) - carried.to_slat(centres - step * axis))
+            / (2 * step)
+            for axis in np.eye(3)
+        ]
+        volumes = abs(np.linalg.det(np.stack(slopes, axis=-1))) * (SIZE / 64) ** 3
+        true = asset.field.properties[:, 1] * volumes
+        np.testing.assert_allclose(mass, true, rtol=1e-4)
+        assert entry["kilograms"] == pytest.approx(true.sum(), rel=1e-5)
+        uneven.append(np.ptp(volumes) / volumes.mean())
+    assert max(uneven) > 0.01 > min(uneven)  # Bent ones, and stretched ones alone.
 
 
 def materials_of(stage: Any, path: str) -> dict[str, np.ndarray]:
