@@ -41,11 +41,11 @@ def evaluate(
     PREDICTIONS is a folder with an npz for each asset, the folder of a
     training, or a Zarr group or HDF5 file with a group for each asset. Each
     has properties (N,3) in normalised space, and may have material (N,) or
-    logits (N,8), coords (N,3), and ranges (3,2) if they differ from the
-    store's. Errors are means over valid voxels, then over objects. An asset
-    of the split with a bad prediction, or without one, is named and omitted;
-    the exit code is then 1. Predictions beside the run.json of a training take
-    the split of the run, unless --split-by or --shares is given.
+    logits (N,8), coords (N,3), valid (N,), and ranges (3,2) if they differ
+    from the store's. Errors are means over valid voxels, then over objects.
+    An asset of the split with a bad prediction, or without one, is named and
+    omitted; the exit code is then 1. Predictions beside the run.json of a
+    training take the split of the run, unless --split-by or --shares is given.
 
     Parameters
     ----------
@@ -122,6 +122,9 @@ def evaluate(
                 "note:    predictions normalised by other ranges, converted to the store's: "
                 f"{result.converted}"
             )
+    if result.classless:
+        some = f"{', '.join(result.classless[:3])} ({len(result.classless)} in all; --json)"
+        output.note(f"note:    predictions without a class, not in the accuracy: {some}")
     if csv_file is not None:
         _write_scores(csv_file, what, measures, spread)
     if picture is not None:

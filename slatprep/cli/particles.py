@@ -27,10 +27,10 @@ class MaterialOptions:
     Attributes
     ----------
     prediction : FILE.npz
-        Predicted materials instead of an asset: coords, material, and properties (normalised with
-        the ranges of --store or --ranges) or properties_si.
+        Predicted materials instead of an asset, as `slatprep evaluate` takes them: coords,
+        material or logits, and properties or properties_si.
     ranges : pixie|FILE
-        Ranges of a prediction's properties.
+        Ranges of a prediction's properties, if its file has none.
     """
 
     store: options.StoreOption | None = None

@@ -69,6 +69,8 @@ class Comparison:
     partly_annotated : int
         Objects with occupied voxels that are not annotated and so not scored. Pixie's loader
         leaves such objects out.
+    classless : list of str
+        Assets whose prediction for SLAT voxels has no class; they are not in its accuracy.
     problems : list of str
         Why assets of the split were left out of the scores of all methods.
     """
@@ -77,6 +79,7 @@ class Comparison:
     methods: Measures
     categories: dict[str, Measures]
     partly_annotated: int
+    classless: list[str]
     problems: list[str]
 
 
@@ -113,18 +116,22 @@ def compare_methods(
     scored: dict[int, list[NDArray[np.float64]]] = {}
     partly: set[str] = set()
     problems: list[str] = []
+    classless: list[str] = []
     with open_predictions(predictions) if predictions else nullcontext() as read:
         for index in select_assets(store, split, **filters).tolist():
             object_id = str(object_ids[index])
             truth = _Truth(store, index)
             try:
-                rows = [score_asset(_ours(predictions, read, truth), truth.voxels)] if read else []
+                ours = _ours(predictions, read, truth) if read else None
+                rows = [score_asset(ours, truth.voxels)] if ours else []
                 for name, root in grids.items():
                     rows += truth.score_grid(root, found[name].get(object_id, []), object_id)
             except InputError as error:
                 problems.append(str(error))
                 continue
             scored[index] = rows
+            if ours and ours.material is None:
+                classless.append(truth.asset_id)
             if (truth.grid == UNANNOTATED).any():
                 partly.add(object_id)
     if not scored:
@@ -134,7 +141,8 @@ def compare_methods(
             f"({problems[0] if problems else 'the split is empty'})",
             "predictions of the same objects",
         )
-    return Comparison(spread, *average_methods(store, scored, names, spread), len(partly), problems)
+    means = average_methods(store, scored, names, spread)
+    return Comparison(spread, *means, len(partly), classless, problems)
 
 
 def _require_pixieverse(store: Store) -> None:
@@ -188,8 +196,9 @@ def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPred
     if arrays is None:
         raise InputError(predictions, f"no prediction of {truth.asset_id}", "one of every asset")
     source = f"{predictions}/{truth.asset_id}"
-    store, coords = truth.store, truth.voxels["coords"]
-    return check_prediction(source, arrays, coords, store.normalization, store.contents)
+    ranges, contents = truth.store.normalization, truth.store.contents
+    coords, labelled = truth.voxels["coords"], truth.voxels["valid"]
+    return check_prediction(source, arrays, coords, ranges, contents, labelled)
 
 
 def draw_comparison(methods: Measures, what: str, form: str) -> bytes:

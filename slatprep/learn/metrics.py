@@ -6,6 +6,7 @@ single voxels.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -97,6 +98,8 @@ class Evaluation:
         Assets of the split without a prediction; they are not in the scores.
     problems : list of str
         Why assets of the split are not in the scores: they have no prediction, or a bad one.
+    classless : list of str
+        Assets whose prediction has no class; they are not in the accuracy.
     converted : int
         Assets whose prediction was normalised by other ranges and was converted to the
         store's.
@@ -110,6 +113,7 @@ class Evaluation:
     categories: dict[str, Measure]
     missing: list[str]
     problems: list[str]
+    classless: list[str] = field(default_factory=list)
     converted: int = 0
     baselines: dict[str, Measure] = field(default_factory=dict)
 
@@ -130,20 +134,23 @@ def score_asset(prediction: VoxelPrediction, truth: Rows) -> NDArray[np.float64]
 
 
 def measure(scores: NDArray[np.float64], spread: Spread, names: Sequence[str] = METRICS) -> Measure:
-    """Return mean and spread of scores (objects, metrics) over at least one object."""
-    count = len(scores)
-    deviation = np.full(len(names), np.nan)
-    if count > 1:
-        deviation = scores.std(axis=0, ddof=0 if spread == "pixie-std" else 1)
-        if spread in ("se", "pixie"):
-            deviation /= np.sqrt(count)
-        if spread in ("pixie", "pixie-std"):
-            deviation[list(names).index("accuracy")] *= _PIXIE_90
-    means, spreads = (
-        dict(zip(names, figures.tolist(), strict=True))
-        for figures in (scores.mean(axis=0), deviation)
-    )
-    return Measure(count, means, spreads)
+    """Return mean and spread of scores (objects, metrics) over at least one object.
+
+    Where objects have NaN as a score, it is measured over the others.
+    """
+    means, spreads = {}, {}
+    for name, column in zip(names, scores.T, strict=True):
+        own = column[~np.isnan(column)]
+        means[name] = float(own.mean()) if own.size else np.nan
+        deviation = np.nan
+        if own.size > 1:
+            deviation = float(own.std(ddof=0 if spread == "pixie-std" else 1))
+            if spread in ("se", "pixie"):
+                deviation /= np.sqrt(own.size)
+            if spread in ("pixie", "pixie-std") and name == "accuracy":
+                deviation *= _PIXIE_90
+        spreads[name] = float(deviation)
+    return Measure(len(scores), means, spreads)
 
 
 Measures = dict[str, Measure]
@@ -167,7 +174,9 @@ def average_methods(
     )
     _, first, number = np.unique(objects, return_index=True, return_inverse=True)
     rows = np.array(list(scored.values()))
-    per_object = np.array([rows[number == k].mean(axis=0) for k in range(len(first))])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Mean of empty slice")  # No view has a class.
+        per_object = np.array([np.nanmean(rows[number == k], axis=0) for k in range(len(first))])
     category, names = categories[first], metrics_of(store.normalization)
 
     def measures(chosen: NDArray[np.bool_]) -> Measures:
@@ -194,6 +203,7 @@ def evaluate_store(
     scored: dict[int, list[NDArray[np.float64]]] = {}
     missing: list[str] = []
     bad: list[str] = []
+    classless: list[str] = []
     converted = 0
     trained = select_assets(store, "train", **filters).tolist()
     baselines = fit_baselines(store, trained) if trained else ()
@@ -207,14 +217,18 @@ def evaluate_store(
                 if arrays is None:
                     missing.append(asset_id)
                     continue
-                coords = rows["coords"]
-                prediction = check_prediction(source, arrays, coords, ranges, store.contents)
+                coords, labelled = rows["coords"], rows["valid"]
+                prediction = check_prediction(
+                    source, arrays, coords, ranges, store.contents, labelled
+                )
             except InputError as error:
                 bad.append(str(error))
                 continue
             converted += prediction.converted
             if not store.contents.classes:
                 prediction = replace(prediction, material=None)
+            elif prediction.material is None:
+                classless.append(asset_id)
             methods = prediction, *(one.predict(rows) for one in baselines)
             scored[index] = [score_asset(one, rows) for one in methods]
     if not scored:
@@ -234,7 +248,7 @@ def evaluate_store(
     beside, groups = average_methods(store, scored, names, spread)
     overall, categories = beside.pop(OURS), {name: own[OURS] for name, own in groups.items()}
     problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
-    return Evaluation(spread, overall, categories, missing, problems, converted, beside)
+    return Evaluation(spread, overall, categories, missing, problems, classless, converted, beside)
 
 
 @dataclass(frozen=True)

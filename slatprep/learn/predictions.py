@@ -7,7 +7,7 @@ type or shape than a prediction's are refused. Zarr is read without zarr-python:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,6 +22,8 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import change_ranges
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
 from slatprep.readers.hdf5 import group_arrays
+from slatprep.readers.pixieverse import UNLABELLED
+from slatprep.readers.slat import check_coords
 from slatprep.readers.splits import HASH, Shares
 from slatprep.records import (
     MANY_BACKGROUND,
@@ -30,6 +32,7 @@ from slatprep.records import (
     Contents,
     Normalization,
     Place,
+    PropertyRange,
     Share,
     Verdict,
 )
@@ -62,14 +65,22 @@ _FORMS = "a directory of <asset id>.npz, a Zarr group or an HDF5 file with a gro
 
 _NUMBERS = "iuf"
 
+_PROPERTIES = ArraySpec(((None, range(1, MAX_PROPERTIES + 1)),), _NUMBERS)
+
 _SPECS = {
-    "properties": ArraySpec(((None, range(1, MAX_PROPERTIES + 1)),), _NUMBERS),
+    "properties": _PROPERTIES,
+    "properties_si": _PROPERTIES,
     "material": ArraySpec(((None,),), _NUMBERS),
     "logits": ArraySpec(((None, range(1, MANY_BACKGROUND + 1)),), _NUMBERS),
-    "coords": ArraySpec(((None, 3),), _NUMBERS),
+    "coords": ArraySpec(((None, 3), (None, 4)), _NUMBERS),
+    "valid": ArraySpec(((None,),), "b" + _NUMBERS),
+    "resolution": ArraySpec(((),), "iu"),
     "ranges": ArraySpec(tuple((n + 1, 2) for n in range(MAX_PROPERTIES)), _NUMBERS),
 }
 """The arrays of a prediction; others are not read."""
+
+_NAMES = {"columns": ArraySpec(((range(1, MAX_PROPERTIES + 1),),), "U")}
+"""Names of the properties, in npz files."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +92,7 @@ class VoxelPrediction:
     properties : ndarray of float64, shape (N, P)
         The store's properties in normalised space.
     material : ndarray of int64, shape (N,), optional
-        Class, below `Contents.n_classes`.
+        Class, below `Contents.n_classes`; -1 where it is not known.
     converted : bool
         Whether it was normalised by other ranges and converted to the store's.
     """
@@ -169,82 +180,161 @@ def require_normalised(source: str | Place, properties: NDArray[np.float64]) -> 
 
 
 def check_prediction(
-    source: str,
+    source: str | Place,
     arrays: Mapping[str, NDArray[Any]],
     coords: NDArray[np.uint8],
     normalization: Normalization,
     contents: Contents = PIXIEVERSE,
+    labelled: NDArray[np.bool_] | None = None,
 ) -> VoxelPrediction:
     """Check a prediction; return it in the order and ranges of the store.
 
-    `arrays` has ``properties`` (N, P); optionally ``material`` (N,) or ``logits`` (N, classes),
-    ``coords`` (N, 3) and ``ranges`` (P, 2). By default coordinates and ranges are the store's,
-    `coords` (N, 3) and `normalization`. InputError, naming `source`, if an array is missing, has
-    another type or shape, is not finite or not normalised, or the voxels differ from the store's.
+    `arrays` has ``properties`` (N, P), and optionally the other arrays of `GivenPrediction`. By
+    default coordinates and ranges are the store's, `coords` (N, 3) and `normalization`. Values are
+    only checked in the voxels that are `labelled` (N,), by default all. InputError, naming
+    `source`, if an array is missing, has another type or shape, is not finite or not normalised,
+    leaves out a labelled voxel, or the voxels differ from the store's.
     """
-    count = len(coords)
+    given, count, columns = GivenPrediction(source, arrays), len(coords), normalization.ranges
     if "properties" not in arrays:
         raise InputError(source, f"has {', '.join(sorted(arrays)) or 'nothing'}", "properties")
-    columns = len(normalization.ranges)
-    properties = _shaped(source, "properties", arrays, (count, columns)).astype(np.float64)
-    if not np.isfinite(properties).all():
-        raise InputError(source, "properties are not all finite", "numbers in normalised space")
-    require_normalised(source, properties)
-    middle = np.median(np.abs(properties), axis=0).max() if count else 0.0
-    if middle > _MIDDLE:
-        what = f"half of the values of a property are beyond {middle:.4g}"
-        raise InputError(source, what, "normalised properties, -1 to 1 within the ranges")
-    converted = False
-    if "ranges" in arrays:
-        spans = _shaped(source, "ranges", arrays, (columns, 2)).astype(np.float64)
+    given.require_columns(tuple(span.name for span in columns))
+    side = given.side(contents.latents.resolution)
+    if side != contents.latents.resolution:
+        raise InputError(source, f"has a grid of {side}^3", f"{contents.latents.resolution}^3")
+    order = np.arange(count)
+    if "coords" in arrays:
+        order = _order(source, given.voxels(side), coords, side)
+    used = np.ones(count, dtype=bool)
+    if labelled is not None:
+        used[order] = labelled
+    if (without := used & ~given.valid(count)).any():
+        row = int(np.argmax(without))
+        raise InputError(
+            source, f"row {row} is not valid", "a prediction of each voxel that the store labels"
+        )
+    properties, ranges = given.normalised(used, columns), given.ranges(columns)
+    converted = ranges is not None and ranges.ranges != columns
+    if ranges is not None and converted:
+        properties = change_ranges(properties, ranges, normalization)
+    material = given.classes(used, contents.n_classes)
+    material = None if material is None else material[order]
+    return VoxelPrediction(properties[order], material, converted)
+
+
+@dataclass(frozen=True)
+class GivenPrediction:
+    """The arrays of a prediction as its file gives them; each method checks those it returns.
+
+    Attributes
+    ----------
+    source : str or Place
+        What errors name.
+    arrays : mapping of str to ndarray
+        ``coords`` (N, 3) or (N, 4), ``properties`` or ``properties_si`` (N, P), ``ranges`` (P, 2),
+        ``columns`` (P,), ``material`` (N,) or ``logits`` (N, classes), ``valid`` (N,) and
+        ``resolution``; any may be missing.
+    """
+
+    source: str | Place
+    arrays: Mapping[str, NDArray[Any]]
+
+    def require_columns(self, names: tuple[str, ...]) -> None:
+        """Raise InputError if the file names other properties, or these in other order."""
+        named = self.arrays.get("columns")
+        if named is not None and tuple(named.tolist()) != names:
+            what = f"predicts {', '.join(map(str, named.ravel()))}"
+            raise InputError(self.source, what, ", ".join(names))
+
+    def side(self, usual: int) -> int:
+        """Return the voxels along an axis, `usual` ones unless the file has another number."""
+        return int(self._shaped("resolution", ())) if "resolution" in self.arrays else usual
+
+    def voxels(self, side: int) -> NDArray[np.uint8]:
+        """Return the coordinates (N, 3), each once, without a batch column."""
+        coords = np.asarray(self.arrays["coords"])
+        coords = self._shaped("coords", (len(coords), 4 if coords.shape[1:] == (4,) else 3))
+        return check_coords(_whole(self.source, "coordinate", coords, side), self.source, side)
+
+    def valid(self, count: int) -> NDArray[np.bool_]:
+        """Return which voxels (N,) are predicted, by default all."""
+        if "valid" not in self.arrays:
+            return np.ones(count, dtype=bool)
+        return self._shaped("valid", (count,)).astype(bool)
+
+    def finite(self, name: str, used: NDArray[np.bool_], columns: int) -> NDArray[np.float64]:
+        """Return properties (N, P), finite in the used rows (N,)."""
+        values = self._shaped(name, (len(used), columns)).astype(np.float64)
+        if (wrong := used & ~np.isfinite(values).all(axis=1)).any():
+            row = int(np.argmax(wrong))
+            what = f"{name} are not all finite: row {row} has {values[row].tolist()}"
+            raise InputError(self.source, what, "numbers in each valid row")
+        return values
+
+    def normalised(
+        self, used: NDArray[np.bool_], table: Sequence[PropertyRange]
+    ) -> NDArray[np.float64]:
+        """Return normalised properties (N, P), of which most used ones are near the ranges."""
+        properties = self.finite("properties", used, len(table))
+        require_normalised(self.source, properties[used])
+        middle = np.median(np.abs(properties[used]), axis=0).max() if used.any() else 0.0
+        if middle > _MIDDLE:
+            what = f"half of the values of a property are beyond {middle:.4g}"
+            raise InputError(self.source, what, "normalised properties, -1 to 1 within the ranges")
+        return properties
+
+    def ranges(self, table: Sequence[PropertyRange]) -> Normalization | None:
+        """Return the ranges that the file gives for the properties of a table, None if none."""
+        if "ranges" not in self.arrays:
+            return None
+        spans = self._shaped("ranges", (len(table), 2)).astype(np.float64)
         if not (np.isfinite(spans).all() and (spans[:, 0] < spans[:, 1]).all()):
             what = f"ranges are {spans.tolist()}"
-            raise InputError(source, what, "lo below hi, a row a property")
-        pairs = zip(normalization.ranges, spans.tolist(), strict=True)
-        own = tuple(replace(one, lo=lo, hi=hi) for one, (lo, hi) in pairs)
-        ranges = Normalization(own, "prediction")
-        converted = ranges.ranges != normalization.ranges
-        if converted:
-            properties = change_ranges(properties, ranges, normalization)
-    material = None
-    if "material" in arrays:
-        material = _shaped(source, "material", arrays, (count,))
-        material = _whole(source, "class", material, contents.n_classes)
-    elif "logits" in arrays:
-        logits = _shaped(source, "logits", arrays, (count, contents.n_classes))
-        if np.isnan(logits).any():
-            raise InputError(source, "logits are not all numbers", "a score for each class")
-        material = logits.argmax(axis=1)
-    if "coords" in arrays:
-        ours = _shaped(source, "coords", arrays, (count, 3))
-        order = _order(source, ours, coords, contents.latents.resolution)
-        properties = properties[order]
-        material = None if material is None else material[order]
-    return VoxelPrediction(properties, material, converted)
+            raise InputError(self.source, what, "lo below hi, a row a property")
+        pairs = zip(table, spans.tolist(), strict=True)
+        return Normalization(tuple(replace(one, lo=lo, hi=hi) for one, (lo, hi) in pairs), "file")
+
+    def classes(self, used: NDArray[np.bool_], count: int) -> NDArray[np.int64] | None:
+        """Return the class (N,) of each used row, None without classes.
+
+        It is `UNLABELLED` in other rows, and where several of the `count` classes share the
+        highest score.
+        """
+        material = np.full(len(used), UNLABELLED, dtype=np.int64)
+        if "material" in self.arrays:
+            given = self._shaped("material", used.shape)[used]
+            material[used] = _whole(self.source, "class", given, count)
+        elif "logits" in self.arrays:
+            scores = self._shaped("logits", (len(used), count))[used]
+            if np.isnan(scores).any():
+                raise InputError(self.source, "logits are not all numbers", "a score a class")
+            highest = scores == scores.max(axis=1, keepdims=True)
+            single = highest.sum(axis=1) == 1
+            material[used] = np.where(single, highest.argmax(axis=1), UNLABELLED)
+        else:
+            return None
+        return material
+
+    def _shaped(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        array = np.asarray(self.arrays[name])
+        if array.dtype.kind not in _SPECS[name].kinds:
+            raise InputError(self.source, f"{name} has dtype {array.dtype.str}", "plain numbers")
+        if array.shape != shape:
+            raise InputError(self.source, f"{name} has shape {array.shape}", f"{shape}")
+        return array
 
 
 def _order(
-    source: str, ours: NDArray[Any], theirs: NDArray[np.uint8], side: int
+    source: str | Place, ours: NDArray[np.uint8], theirs: NDArray[np.uint8], side: int
 ) -> NDArray[np.int64]:
-    keys = (flat_index(_whole(source, "coordinate", ours, side), side), flat_index(theirs, side))
+    keys = (flat_index(ours, side), flat_index(theirs, side))
     mine, stored = (np.argsort(key, kind="stable") for key in keys)
     if not np.array_equal(keys[0][mine], keys[1][stored]):
         raise InputError(source, "has other voxels than the store", "the store's voxel/coords")
     return mine[np.argsort(stored)]
 
 
-def _shaped(
-    source: str, name: str, arrays: Mapping[str, NDArray[Any]], shape: tuple[int, ...]
-) -> NDArray[Any]:
-    array = np.asarray(arrays[name])
-    if array.dtype.kind not in _NUMBERS:
-        raise InputError(source, f"{name} has dtype {array.dtype.str}", "plain numbers")
-    if array.shape != shape:
-        raise InputError(source, f"{name} has shape {array.shape}", f"{shape}")
-    return array
-
-
-def _whole(source: str, what: str, values: NDArray[Any], stop: int) -> NDArray[np.int64]:
+def _whole(source: str | Place, what: str, values: NDArray[Any], stop: int) -> NDArray[np.int64]:
     """Return numbers of any type as integers, if they are whole and in 0..stop-1."""
     wrong = values[~((values >= 0) & (values < stop) & (values == np.floor(values)))]
     if wrong.size:
@@ -254,10 +344,13 @@ def _whole(source: str, what: str, values: NDArray[Any], stop: int) -> NDArray[n
 
 def _npz(folder: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
     path = folder / f"{file_name(asset_id)}.npz"
-    if not path.exists():
-        return None
-    data, _ = load_source(path, folder, "prediction")
-    return npz_arrays(data, path, _SPECS, partial=True)
+    return read_npz(path) if path.exists() else None
+
+
+def read_npz(path: Path) -> Mapping[str, NDArray[Any]]:
+    """Read the arrays of a prediction from an npz file."""
+    data, _ = load_source(path, path.parent, "prediction")
+    return npz_arrays(data, path, _SPECS | _NAMES, partial=True)
 
 
 def _hdf5(file: Any, path: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:

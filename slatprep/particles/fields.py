@@ -13,12 +13,13 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.export.formats import require_solver_classes
 from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.voxels import shown_in_cells
-from slatprep.normalize import denormalize_properties
-from slatprep.readers.files import ArraySpec, load_source, npz_arrays, npz_small_arrays
-from slatprep.readers.slat import COORDS, check_coords
+from slatprep.learn.predictions import GivenPrediction, read_npz
+from slatprep.normalize import PIXIE_RANGES, denormalize_properties
+from slatprep.readers.voxel_sets import physical
 from slatprep.records import (
     BACKGROUND,
     MAX_LATENT_RESOLUTION,
+    PROPERTIES,
     PROPERTY_COLUMNS,
     RESOLUTION,
     Normalization,
@@ -27,17 +28,6 @@ from slatprep.store import Store
 from slatprep.store.records import StoredRecords
 
 Points = Literal["slat", "grid"]
-
-_SPECS = {
-    "coords": COORDS,
-    "material": ArraySpec(shapes=((None,),), kinds="iu"),
-}
-_PROPERTIES = ArraySpec(shapes=((None, 3),), kinds="f")
-_MORE = {
-    "properties_si": _PROPERTIES,
-    "valid": ArraySpec(shapes=((None,),), kinds="b"),
-    "resolution": ArraySpec(shapes=((),), kinds="iu"),
-}
 
 
 @dataclass(frozen=True)
@@ -94,51 +84,45 @@ def stored_field(store: Store, name: str | int, points: Points = "slat") -> Voxe
 
 
 def predicted_field(path: Path, normalization: Normalization | None) -> VoxelField:
-    """Read predicted materials of the SLAT frame, as `slatprep export --format npz` writes them.
+    """Read predicted materials of the SLAT frame: the npz of `slatprep predict` or of an export.
 
-    The npz has ``coords``, ``material``, ``properties`` or ``properties_si``, and may have
-    ``valid`` and ``resolution``. InputError if it cannot be used, ConfigError if its
-    properties are normalised and `normalization` is None.
+    It has ``coords``, ``material`` or ``logits``, and ``properties_si`` or ``properties``, which
+    are normalised by its own ``ranges`` or else by `normalization`. InputError if it cannot be
+    used or a material cannot have its values, ConfigError if the ranges are not known.
     """
-    data, _ = load_source(path, path.parent, "slat")
-    arrays = npz_arrays(data, path, _SPECS)
-    arrays |= npz_arrays(data, path, _MORE, partial=True)
-    side = int(arrays.get("resolution", RESOLUTION))
+    given = GivenPrediction(path, read_npz(path))
+    given.require_columns(PROPERTY_COLUMNS)  # Solvers need these columns.
+    side = given.side(RESOLUTION)
     if not 2 <= side <= MAX_LATENT_RESOLUTION:
         raise InputError(path, f"has a grid of {side}^3", f"2 to {MAX_LATENT_RESOLUTION} a side")
-    coords = check_coords(arrays["coords"], path, side)
-    material = arrays["material"]
-    named = npz_small_arrays(data, path, ArraySpec(shapes=(), kinds="U"))[0].get("columns")
-    if named is not None and tuple(named.tolist()) != PROPERTY_COLUMNS:
-        raise InputError(  # Solvers need these columns.
-            path, f"predicts {', '.join(map(str, named.ravel()))}", ", ".join(PROPERTY_COLUMNS)
-        )
-    values = arrays.get("properties_si")
-    if values is None:
-        values = npz_arrays(data, path, {"properties": _PROPERTIES})["properties"]
-        if normalization is None:
+    if "coords" not in given.arrays:
+        raise InputError(path, f"has {', '.join(given.arrays) or 'nothing'}", "coords")
+    coords = given.voxels(side)
+    valid = given.valid(len(coords))
+    if not valid.any():
+        raise InputError(path, f"none of {len(coords)} voxels is valid", "a valid voxel")
+    material = given.classes(valid, BACKGROUND + 1)
+    if material is None:
+        raise InputError(path, f"has {', '.join(given.arrays)}", "material or logits as well")
+    if "properties_si" in given.arrays:
+        values = given.finite("properties_si", valid, len(PROPERTIES)).astype(np.float32)
+    elif "properties" in given.arrays:
+        ranges = given.ranges(PIXIE_RANGES.ranges) or normalization
+        if ranges is None:
             raise ConfigError(
                 f"{path} holds normalised properties; name their store or their ranges "
                 "(--store or --ranges), or save SI values as properties_si"
             )
-        values = denormalize_properties(values, normalization)
-    valid = arrays.get("valid", np.ones(len(coords), dtype=bool))
-    lengths = {len(coords), len(material), len(values), len(valid)}
-    if len(lengths) > 1 or not valid.any():
-        raise InputError(
-            path,
-            f"has {len(coords)} coords, {len(material)} material, {len(values)} properties, "
-            f"{np.count_nonzero(valid)} of {len(valid)} valid",
-            "as many of each, and at least one valid voxel",
-        )
-    wrong = valid & ((material < 0) | (material >= BACKGROUND) | ~np.isfinite(values).all(axis=1))
-    if wrong.any():
+        values = denormalize_properties(given.normalised(valid, ranges.ranges), ranges)
+    else:
+        raise InputError(path, f"has {', '.join(given.arrays)}", "properties or properties_si")
+    fine = (material >= 0) & (material < BACKGROUND) & physical(values, PROPERTIES).all(axis=1)
+    if (wrong := valid & ~fine).any():
         first = int(np.argmax(wrong))
         raise InputError(
             path,
-            f"row {first} has material {material[first]} and properties {values[first].tolist()}",
-            "material 0..6 and finite properties in every valid row",
+            f"row {first} has class {material[first]} and properties {values[first].tolist()}",
+            f"in every valid row class 0..6, {', '.join(one.allowed for one in PROPERTIES)}",
         )
     cells, row = shown_in_cells(coords[valid], side)
-    material, values = material[valid].astype(np.uint8), values[valid].astype(np.float32)
-    return VoxelField(cells, material[row], values[row])
+    return VoxelField(cells, material[valid].astype(np.uint8)[row], values[valid][row])

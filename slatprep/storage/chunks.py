@@ -231,5 +231,6 @@ def read_chunks(
 
 def place_chunk(array: NDArray[Any], corner: Sequence[int], block: NDArray[Any]) -> None:
     """Write a chunk into an array at a corner, without the part that lies beyond the array."""
-    there = array[tuple(map(slice, corner, map(add, corner, block.shape)))]
+    where: Any = map(slice, corner, map(add, corner, block.shape))
+    there = array[(*where, ...)]  # With the ellipsis a single number is a view, too.
     there[...] = block[tuple(map(slice, there.shape))]

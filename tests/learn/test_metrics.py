@@ -4,7 +4,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -85,6 +85,72 @@ def test_against_a_plain_computation(learn_store, predicted, form):
     assert list(result.overall.means.values()) == pytest.approx(np.mean(rows, axis=0).tolist())
     error = np.std(rows, axis=0, ddof=1) / np.sqrt(8)
     assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
+
+
+def write_changed(folder: Path, store: Path, change: Callable[..., Mapping[str, Any]]) -> Path:
+    """Write the labels as predictions, changed by number of the asset, arrays and valid voxels."""
+    opened = open_store(store)
+    for row, asset_id in enumerate(opened.ids):
+        truth = opened.read(row, ("coords", "properties", "material", "valid"))
+        write_one(folder, "npz", asset_id, change(row, right(truth), truth))
+    return folder
+
+
+def test_only_labelled_voxels_of_a_prediction_count(learn_store, tmp_path):
+    def change(_: int, arrays: dict[str, Any], truth: dict[str, Any]) -> dict[str, Any]:
+        count, wrong = len(truth["coords"]), ~truth["valid"]
+        arrays["properties"][wrong] = np.nan
+        arrays["material"][wrong] = 255
+        coords = np.hstack([np.zeros((count, 1), np.int32), truth["coords"]])
+        return arrays | {"coords": coords, "valid": truth["valid"], "resolution": np.array(64)}
+
+    folder = write_changed(tmp_path / "p", learn_store, change)
+    means = evaluate_store(folder, learn_store, None).overall.means
+    assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_columns_in_another_order_are_not_measured(learn_store, tmp_path):
+    def change(_: int, arrays: dict[str, Any], truth: object) -> dict[str, Any]:
+        return arrays | {"columns": np.array(["density", "youngs_modulus", "poissons_ratio"])}
+
+    folder = write_changed(tmp_path / "p", learn_store, change)
+    with pytest.raises(InputError, match="predicts density, youngs_modulus, poissons_ratio"):
+        evaluate_store(folder, learn_store, None)
+
+
+def test_equal_scores_are_no_class(learn_store, tmp_path):
+    def change(_: int, arrays: dict[str, Any], truth: object) -> dict[str, Any]:
+        scores = np.eye(8)[arrays.pop("material")]
+        scores[::2] = 0.0
+        return arrays | {"logits": scores}
+
+    store = open_store(learn_store)
+    folder = write_changed(tmp_path / "p", learn_store, change)
+    result = evaluate_store(folder, learn_store, None)
+    by_object: dict[str, list[float]] = {}
+    for row, name in enumerate(store.column("object_id")):
+        valid = store.read(row, ("valid",))["valid"]
+        by_object.setdefault(name, []).append((np.flatnonzero(valid) % 2).mean())
+    expected = np.mean([np.mean(views) for views in by_object.values()])
+    assert result.overall.means["accuracy"] == pytest.approx(expected)
+
+
+def test_accuracy_is_of_the_predictions_with_classes(learn_store, tmp_path):
+    def change(row: int, arrays: dict[str, Any], truth: object) -> dict[str, Any]:
+        return arrays if row else {"properties": arrays["properties"]}
+
+    folder = write_changed(tmp_path / "p", learn_store, change)
+    first = open_store(learn_store).ids[0]
+    words = ("evaluate", folder, "--store", learn_store, "--split", "all")
+    shown = run(*words)
+    assert (
+        f"predictions without a class, not in the accuracy: {first} (1 in all; --json)"
+        in shown.stderr
+    )
+    told = document(*words)
+    assert told["classless"] == [first]
+    assert told["overall"]["means"]["accuracy"] == 1.0
+    assert compare_methods(folder, {}, learn_store, None).classless == [first]
 
 
 def test_published_rows_agree_with_themselves_and_what_is_printed():

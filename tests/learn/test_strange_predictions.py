@@ -75,15 +75,18 @@ def test_nothing_is_read_or_written_outside(learn_store, tmp_path):
     ("logits", "5", "has dtype"),
     ("coords", np.nan, "has coordinate nan"),
     ("coords", 1.5, "has coordinate 1.5"),
-    ("coords", 1, "other voxels"),
+    ("coords", 1, "occurs twice"),
+    ("valid", False, "row 0 is not valid"),
+    ("resolution", np.array(32), r"has a grid of 32\^3; expected 64\^3"),
     ("E", np.zeros(3), "expected properties"),
 ])  # fmt: skip
 @pytest.mark.parametrize("form", ["npz", "hdf5", "zarr"])
 def test_values_that_are_no_prediction_are_named(learn_store, tmp_path, name, value, message, form):
     count = open_store(learn_store).rows(0)[1]
-    widths = {"properties": (3,), "material": (), "coords": (3,), "logits": (8,)}
+    widths = {"properties": (3,), "material": (), "coords": (3,), "logits": (8,), "valid": ()}
     whole = {} if name == "E" else {"properties": np.zeros((count, 3))}
-    whole[name] = np.asarray(value) if np.ndim(value) else np.full((count, *widths[name]), value)
+    as_it_is = isinstance(value, np.ndarray)
+    whole[name] = value if as_it_is else np.full((count, *widths[name]), value)
     path = tmp_path / "p"
     write_one(path, form, "a", whole)
     if form == "zarr":

@@ -17,6 +17,7 @@ from slatprep.export import ExportOptions, export_store
 from slatprep.particles.fields import VoxelField, predicted_field
 from slatprep.particles.read import read_particles
 from slatprep.particles.transfer import transfer
+from slatprep.store import open_store
 
 # As TRELLIS names and orders the fields of a Gaussian (`construct_list_of_attributes`).
 GAUSSIAN = [
@@ -276,9 +277,37 @@ def test_prediction_in_si_needs_no_ranges(tmp_path):
     np.testing.assert_array_equal(field.voxels, [[1, 2, 3]])
     np.testing.assert_array_equal(field.properties, values[:1])
     with pytest.raises(ConfigError, match="--ranges"):
-        predicted(properties=values)
-    with pytest.raises(InputError, match="row 1 has material 255 and properties"):
+        predicted(properties=values, valid=np.array([True, False]))
+    with pytest.raises(InputError, match="has class 255"):
         predicted(properties_si=values)
+
+
+def test_prediction_by_its_own_ranges(store, tmp_path):
+    asset = open_store(store)["cup"]
+    spans = np.array([[2.0, 12.0], [1.0, 5.0], [0.0, 0.5]])
+    mapped = asset.properties_si[asset.valid].astype(np.float64)
+    mapped[:, :2] = np.log10(mapped[:, :2])
+    values = 2 * (mapped - spans[:, 0]) / (spans[:, 1] - spans[:, 0]) - 1
+    scores = np.eye(8)[asset.material[asset.valid]]
+    arrays = {"coords": asset.coords[asset.valid], "properties": values, "logits": scores}
+    np.savez(tmp_path / "p.npz", **arrays, ranges=spans)
+    for normalization in (open_store(store).normalization, None):
+        field = predicted_field(tmp_path / "p.npz", normalization)
+        np.testing.assert_allclose(field.properties, asset.properties_si[asset.valid], rtol=1e-5)
+        np.testing.assert_array_equal(field.material, asset.material[asset.valid])
+    arrays["logits"] = np.zeros_like(scores)
+    np.savez(tmp_path / "p.npz", **arrays, ranges=spans)
+    with pytest.raises(InputError, match="row 0 has class -1"):
+        predicted_field(tmp_path / "p.npz", None)
+
+
+@pytest.mark.parametrize("wrong", [(-5.0, 1e3, 0.3), (1e5, 0.0, 0.3), (1e5, 1e3, 0.9)])
+def test_prediction_of_values_that_no_material_has(tmp_path, wrong):
+    values = np.array([(1e5, 1e3, 0.3), wrong])
+    coords = np.array([[1, 2, 3], [4, 5, 6]])
+    np.savez(tmp_path / "p.npz", coords=coords, material=np.zeros(2, int), properties_si=values)
+    with pytest.raises(InputError, match="row 1 has class 0 and properties"):
+        predicted_field(tmp_path / "p.npz", None)
 
 
 def test_a_file_that_transfer_did_not_write_is_not_replaced(store, tmp_path):
