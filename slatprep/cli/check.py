@@ -169,7 +169,7 @@ def _print(output: Output, checks: list[AlignmentCheck]) -> None:
                     for figure in one.figures
                 ],
             )
-        for words in one.reasons if len(checks) > 1 else one.words:
+        for words in one.remarks if len(checks) > 1 else one.words:
             say(f"{one.asset_id}: {words}")
         for words in one.unusual:
             say(f"{one.asset_id}: unusual: {words}")

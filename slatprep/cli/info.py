@@ -95,9 +95,12 @@ def show_quality(
         options = " ".join(f"--verdict {name}" for name in doubted)
         say(f"why:     slatprep list {store} {options}")
     if total.ambiguous:
+        # An open tie makes an asset doubtful at best.
+        settled = f"; {total.settled:,} good, settled by consensus or latents" * (total.settled > 0)
         say(
             f"ambiguous: {total.ambiguous:,} of {total.assets:,}: other placements fit about as "
-            f"well, and change the class of more than {THRESHOLDS.good_ambiguity:.0%} of the voxels"
+            f"well, and change labels of more than {THRESHOLDS.good_ambiguity:.0%} of the "
+            f"voxels{settled}"
         )
         say(f"look:    slatprep check-alignment --ambiguous --store {store}")
 

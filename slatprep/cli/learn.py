@@ -15,7 +15,7 @@ import click
 
 from slatprep.cli import options
 from slatprep.cli.latents import Standardised
-from slatprep.cli.output import Output
+from slatprep.cli.output import Cell, Output
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError, InputError
 
@@ -198,8 +198,8 @@ def _tell_epoch(output: Output, name: str, record: EpochRecord) -> None:
     told = f"{name}, epoch {record.epoch}: train loss {record.train_loss:.4f}"
     if not math.isnan(record.val_loss):
         told += (
-            f", validation loss {record.val_loss:.4f}, MSE {record.val_mse:.4f}, "
-            f"accuracy {record.val_accuracy:.3f}"
+            f", validation loss {record.val_loss:.4f}, MSE {record.val_mse:.4f}"
+            + f", accuracy {record.val_accuracy:.3f}" * (not math.isnan(record.val_accuracy))
         )
     output.note(told)
     output.if_stopped = (
@@ -211,14 +211,15 @@ def _tell_epoch(output: Output, name: str, record: EpochRecord) -> None:
 def _show_training(output: Output, summaries: dict[str, TrainSummary]) -> None:
     best = {name: summary.history[summary.best_epoch] for name, summary in summaries.items()}
     references = next(iter(summaries.values())).references
-    output.table(
-        "Validation (mean squared error in normalised space, mean over assets)",
-        ("model", "epoch", "mse", "accuracy"),
-        [
-            *((f"decoder, {n}", e.epoch, e.val_mse, e.val_accuracy) for n, e in best.items()),
-            *((name, None, error, None) for name, error in references.items()),
-        ],
-    )
+    rows: list[tuple[Cell, ...]] = [
+        *((f"decoder, {n}", e.epoch, e.val_mse, e.val_accuracy) for n, e in best.items()),
+        *((name, None, error, None) for name, error in references.items()),
+    ]
+    # Without classes there is no accuracy.
+    classified = not all(math.isnan(epoch.val_accuracy) for epoch in best.values())
+    columns = ("model", "epoch", "mse", "accuracy")[: 4 if classified else 3]
+    title = "Validation (mean squared error in normalised space, mean over assets)"
+    output.table(title, columns, [row[: len(columns)] for row in rows])
 
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
-from slatprep.judge import THRESHOLDS, verdict_of
-from slatprep.records import Place, Verdict
+from slatprep.judge import THRESHOLDS, labels_word, verdict_of
+from slatprep.records import Consensus, Place, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset, open_store
 from slatprep.store.records import StoredRecords
@@ -71,9 +71,9 @@ class Figure:
 
     @property
     def threshold_text(self) -> str:
-        """The threshold in words, like ``>= 0.8``; empty if there is none."""
+        """The threshold in words, like ``>= 0.8``, or ``settled``; empty if there is none."""
         if self.passes is None:
-            return ""
+            return "settled" if self.settled else ""
         sign, _, limit = LIMITS[self.name]
         return f"{sign} {limit:g}"
 
@@ -107,6 +107,11 @@ class AlignmentCheck:
         Distance [voxel] up to which fitness counts a voxel as near the other side.
     unusual : tuple of str
         What is unusual about its values, masks, places or latents.
+    ties : str
+        What other placements that fit about as well would change, and what chose among them.
+    settled_by : dict of str to float
+        ``consensus`` or ``latents``, if either chose the placement, and the probability that the
+        choice is right.
     """
 
     asset_id: str
@@ -117,18 +122,23 @@ class AlignmentCheck:
     transform: NDArray[np.float64]
     radius: float
     unusual: tuple[str, ...]
+    ties: str
+    settled_by: dict[str, float]
 
     def value(self, name: str) -> float:
         """Return the value of a figure; NaN if the store does not have it."""
         return next((figure.value for figure in self.figures if figure.name == name), math.nan)
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """Why the verdict is not better, and what chose among placements."""
+        return (*self.reasons, *([self.ties] if self.settled_by else []))
+
+    @property
     def words(self) -> tuple[str, ...]:
         """The reasons of the verdict: why it is not better, or what makes it good."""
         if self.reasons:
-            return self.reasons
-        open_share = self.value("ambiguity")
-        ties = f"the class of {open_share:.1%} of the voxels" if open_share else "no class"
+            return self.remarks
         if all(figure.ok for figure in self.figures if figure.name in _QUALITY):
             sure, same, placed = map(self.value, ("confidence", "same_object", "right_placement"))
             rests = (
@@ -141,7 +151,7 @@ class AlignmentCheck:
                 f"{forward:.1%} of the PixieVerse boundary and {backward:.1%} of the SLAT boundary "
                 f"lie within {self.radius:g} voxel of the other side before any deformation"
             )
-        return (f"{rests}; placements that fit as well change {ties}",)
+        return (f"{rests}; {self.ties}",)
 
     @property
     def consistent(self) -> bool:
@@ -182,7 +192,17 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     if not all(figure.ok for figure in figures):
         # The probabilities were computed for the stored fit and hold for no other.
         judgement = replace(judgement, same_object=math.nan, right_placement=math.nan)
-    verdict, reasons = verdict_of(replace(alignment, quality=quality), judgement, valid_share)
+    labels = labels_word(store.contents.classes)
+    verdict, reasons = verdict_of(
+        replace(alignment, quality=quality), judgement, valid_share, labels
+    )
+    ambiguity = judgement.ambiguity.material_share
+    ties = f"the {labels} of {ambiguity:.1%} of the voxels" if ambiguity else f"no {labels}"
+    ties, settled_by = f"placements that fit as well change {ties}", {}
+    if (by := alignment.settled_by) is not None:
+        name = "consensus" if isinstance(by, Consensus) else "latents"
+        settled_by = {name: by.probability}
+        ties = f"settled by {name}, right with a probability of {by.probability:.1%}: other {ties}"
 
     def stored(name: str, settled: bool = False) -> Figure:
         return Figure(name, float(columns[name]), float(columns[name]), 0, settled)
@@ -210,8 +230,9 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
             figures.append(Figure(f"mean {name}", mean, mean, 0))
     said, odd = str(columns["verdict"]), tuple(str(columns["unusual"]).splitlines())
     return AlignmentCheck(
-        asset.asset_id, verdict, reasons, said, tuple(figures), asset.transform, radius, odd
-    )
+        asset.asset_id, verdict, reasons, said, tuple(figures), asset.transform, radius, odd, ties,
+        settled_by,
+    )  # fmt: skip
 
 
 def recompute_annotation(asset: StoredAsset) -> tuple[float, dict[str, NDArray[np.float64]]]:

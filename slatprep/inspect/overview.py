@@ -31,8 +31,9 @@ class GroupOverview:
 
     ``verdicts`` counts the assets by verdict. Confidence, expected accuracy, fitness, rmse [voxel]
     and overlap are medians over the assets; ``valid_share`` is over all their voxels. ``ambiguous``
-    counts assets above the threshold of ambiguity. ``unphysical`` counts PixieVerse voxels without
-    an annotation because no material has their properties.
+    counts assets above the threshold of ambiguity, and ``settled`` the good ones among them.
+    ``unphysical`` counts PixieVerse voxels without an annotation because no material has their
+    properties.
     """
 
     name: str
@@ -47,6 +48,7 @@ class GroupOverview:
     overlap: float
     valid_share: float
     ambiguous: int
+    settled: int
     unphysical: int
 
 
@@ -99,6 +101,7 @@ def overview_of(store: Store) -> StoreOverview:
 def _group(name: str, columns: dict[str, NDArray[Any]], chosen: list[int]) -> GroupOverview:
     own = {column: values[chosen] for column, values in columns.items()}
     voxels, verdicts = int(own["voxels"].sum()), _counts(own["verdict"])
+    tied = own["ambiguity"] > THRESHOLDS.good_ambiguity
     return GroupOverview(
         name=name,
         assets=len(chosen),
@@ -106,7 +109,8 @@ def _group(name: str, columns: dict[str, NDArray[Any]], chosen: list[int]) -> Gr
         verdicts={str(verdict): verdicts.get(str(verdict), 0) for verdict in Verdict},
         **{median: float(np.median(own[median])) for median in _MEDIANS},
         valid_share=float(own["valid_share"] @ own["voxels"] / voxels),
-        ambiguous=int((own["ambiguity"] > THRESHOLDS.good_ambiguity).sum()),
+        ambiguous=int(tied.sum()),
+        settled=int((tied & (own["verdict"] == Verdict.GOOD)).sum()),
         unphysical=int(own["unphysical"].sum()),
     )
 

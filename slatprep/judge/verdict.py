@@ -130,7 +130,8 @@ def judge(
         right_placement=placed,
         evidence=tuple(evidence.tolist()),
     )
-    verdict, reasons = verdict_of(alignment, found, float(valid.mean()))
+    share = float(valid.mean())
+    verdict, reasons = verdict_of(alignment, found, share, labels_word(field.classified))
     return replace(found, verdict=verdict, reasons=reasons), likely
 
 
@@ -185,8 +186,13 @@ def voxel_confidence(
     return class_confidence(around, confidence, annotation.valid)
 
 
+def labels_word(classified: object) -> str:
+    """Return the word for what voxels of a dataset get: a class or, without classes, properties."""
+    return "class" if classified else "properties"
+
+
 def verdict_of(
-    alignment: Alignment, judgement: Judgement, valid_share: float
+    alignment: Alignment, judgement: Judgement, valid_share: float, labels: str = "class"
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Return the verdict on an alignment, and the reasons why it is not better.
 
@@ -222,8 +228,8 @@ def verdict_of(
     if tied:
         others = "another placement fits" if ties == 1 else f"{ties} other placements fit"
         reasons.append(
-            f"{others} about as well and would change the class of {ambiguity:.1%} of the "
-            f"voxels (good needs {limits.good_ambiguity:.0%})"
+            f"{others} about as well and would change the {labels} of {ambiguity:.1%} of "
+            f"the voxels (good needs {limits.good_ambiguity:.0%})"
         )
     if alignment.margin < 0.0:
         reasons.append(

@@ -238,7 +238,9 @@ def test_figures_are_medians_over_assets_and_shares_over_voxels(copy):
     assert overview.total.voxels == voxels.sum() == group["voxel/coords"].shape[0]
     assert overview.total.fitness == pytest.approx(0.3)
     assert overview.total.ambiguous == len(choose_assets(open_store(copy), ambiguous=True)) == 1
-    assert "\nambiguous: 1 of 5: other placements" in run("info", copy).stdout
+    said = run("info", copy).stdout
+    assert "\nambiguous: 1 of 5: other placements fit about as well, and change labels" in said
+    assert "5% of the voxels; 1 good, settled by consensus or latents\n" in said
     valid = voxels @ [1.0, 0.0, 0.5, 0.25, 1.0]
     assert overview.total.valid_share == pytest.approx(valid / voxels.sum())
     assert overview.total.verdicts == {"good": 5, "doubtful": 0, "failed": 0}

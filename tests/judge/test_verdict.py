@@ -347,5 +347,7 @@ def test_without_classes_a_property_that_changes_notably_counts_by_hand():
     annotation = sample(field, latents.centres, PARAMETERS)
     ambiguity = measure_ambiguity(field, latents, half_a_turn, annotation, PARAMETERS)
     assert ambiguity.material_share == pytest.approx((4 + 2) / 10)
+    reasons = judge(field, latents, half_a_turn, annotation, PARAMETERS)[0].reasons
+    assert any("would change the properties of 60.0% of the voxels" in one for one in reasons)
     expected = ((1 + 0.05 + 0.05 + 1) / 4, 0.0, 0.0)
     np.testing.assert_allclose(ambiguity.property_change, expected, atol=1e-6)

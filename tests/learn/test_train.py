@@ -413,6 +413,14 @@ def test_steps_end_where_they_are_told_to(learn_store, tmp_path, steps):
     assert seen == [(k, done) for k in range(done + 1)]
 
 
+def test_without_classes_no_accuracy_is_told(learn_store, tmp_path, monkeypatch):
+    monkeypatch.setattr("slatprep.learn.train._Session.validate", lambda _: (0.5, 0.25, math.nan))
+    words = ("train", learn_store, "--out", tmp_path / "run", "--epochs", "1", *FAST)
+    said = run(*words).output
+    assert "MSE 0.2500" in said and "0.25" in said.split("Validation")[1]
+    assert "accuracy" not in said and "nan" not in said
+
+
 def test_the_last_weights_need_no_validation(learn_store, tmp_path):
     shares = Shares(0.9, 0.0, 0.1)
     two = TrainParameters(size="tiny", epochs=2, learning_rate=2e-3, shares=shares, keep="last")

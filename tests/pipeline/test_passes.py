@@ -188,6 +188,15 @@ def test_ties_that_change_labels_are_settled_right_and_recorded(telling, stores)
             assert judgement["right_placement"] <= entry["settled_by"]["probability"]
             assert judgement["verdict"] == "good"
             assert alone[asset_id]["judgement"]["verdict"] == "doubtful"
+        check = check_alignment(stores[1], asset_id)
+        (figure,) = [one for one in check.figures if one.name == "ambiguity"]
+        probability = entry["settled_by"]["probability"]
+        assert check.settled_by == {"latents": probability}
+        assert (figure.threshold_text, figure.passes) == ("settled", None)
+        told = (
+            f"settled by latents, right with a probability of {probability:.1%}: other placements"
+        )
+        assert told in check.words[-1] and not check.reasons
     assert any(before[asset_id] < 0.9 for asset_id in settled)
     moved = sum(heard[k]["alignment"]["transform"] != alone[k]["alignment"]["transform"]
                 for k in settled)  # fmt: skip

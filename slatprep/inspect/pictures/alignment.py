@@ -5,14 +5,17 @@ The column at the right has figures, a histogram of errors, and the starts of th
 
 from __future__ import annotations
 
+import math
 import textwrap
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.consensus import degrees_between
+from slatprep.align.consensus import NEAR_DEGREES, degrees_between
+from slatprep.align.starts import euler_starts
 from slatprep.geometry.frames import split_transform
 from slatprep.inspect.check import AlignmentCheck
 from slatprep.inspect.pictures import canvas
@@ -26,7 +29,14 @@ from slatprep.inspect.pictures.scene import (
     views,
 )
 from slatprep.inspect.pictures.voxels import Drawing, View, draw_voxels
-from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, RESOLUTION, Alignment, Search
+from slatprep.records import (
+    MATERIAL_CLASSES,
+    MATERIAL_COLOURS,
+    RESOLUTION,
+    Alignment,
+    Candidate,
+    Search,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -282,21 +292,38 @@ def _candidates(figure: Figure, alignment: Alignment, left: float, y: float) -> 
     words = f"{len(own)} distinct of {len(candidates)}, by coarse fitness"
     axes = _plot(figure, left, y, heading, words)
     wide = alignment.search is Search.SO3
-    colours = [canvas.RULE if wide else canvas.ACCENT] + [canvas.RULE] * (len(own) - 1)
+    taken = None if wide else _start_taken(alignment, own)
+    colours = [canvas.ACCENT if k == taken else canvas.RULE for k in range(len(own))]
     axes.bar(range(len(own)), [c.fitness for c in own], width=0.78, color=colours)
     axes.set_xlim(-0.8, max(len(own), 2) - 0.2)
     axes.set_ylim(0, 1)
     axes.set_yticks([0, 0.5, 1])
-    best = own[0]
     if wide:
         name = "quarter turns fit poorly, so all orientations"
         name += "\nwere searched: look whether the result fits"
         axes.set_xticks([-0.4], [name], ha="left")
-    elif best.euler_degrees is not None:
-        name = "start at " + ", ".join(f"{angle:g}°" for angle in best.euler_degrees)
-        axes.set_xticks([0], [name], ha="left")
+    elif taken is not None:
+        angles = own[taken].euler_degrees or ()
+        name = "start at " + ", ".join(f"{angle:g}°" for angle in angles)
+        axes.set_xticks([taken], [name], ha="left" if taken < len(own) / 2 else "right")
     else:
         axes.set_xticks([])
+
+
+def _start_taken(alignment: Alignment, starts: Sequence[Candidate]) -> int | None:
+    """Return which start has the alignment's rotation, about; it need not be that which fits best.
+
+    Other placements may fit about as well, and consensus or latents may choose one. None if no
+    start has the rotation.
+    """
+    rotation = split_transform(alignment.transform)[0]
+    named = {one.index: one.rotation for one in euler_starts()}
+    apart = [
+        math.inf if one.euler_degrees is None else degrees_between(named[one.index], rotation)
+        for one in starts
+    ]
+    nearest = int(np.argmin(apart))
+    return nearest if apart[nearest] <= NEAR_DEGREES else None
 
 
 def _heading(figure: Figure, left: float, y: float, heading: str, words: str) -> None:

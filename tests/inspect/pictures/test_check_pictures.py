@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
@@ -20,8 +21,14 @@ from support.made_store import rewrite
 from support.synthetic import QUARTER_TURN
 from support.trees import tree
 
+from slatprep.align.starts import euler_starts
 from slatprep.errors import StoreError
-from slatprep.geometry.frames import apply_transform, invert_transform, voxel_centres
+from slatprep.geometry.frames import (
+    apply_transform,
+    invert_transform,
+    make_transform,
+    voxel_centres,
+)
 from slatprep.inspect.check import AlignmentCheck, check_alignment, choose_assets
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import HEIGHT, PANEL, WIDTH, draw_alignment, panels
@@ -29,7 +36,7 @@ from slatprep.inspect.pictures.scene import FARTHEST, Scene, distance_colours, s
 from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.voxels import View
 from slatprep.inspect.pictures.write import write_pictures
-from slatprep.records import Alignment, Placement, Search
+from slatprep.records import Alignment, Candidate, Placement, Search
 from slatprep.store import open_store
 from slatprep.store.records import StoredRecords
 
@@ -130,6 +137,26 @@ def test_the_next_of_tied_placements_stands_beside_the_chosen_one(copy):
     assert np.abs(drawn.pop("another") - drawn["after"]).sum() > 9
     assert drawn.keys() == alone.keys()
     assert all(np.array_equal(drawn[name], alone[name]) for name in alone)
+
+
+@pytest.mark.usefixtures("sides")
+def test_the_start_that_was_taken_is_marked_though_another_fits_better(copy):
+    one, check, alignment = of_ant(copy)
+    turn = euler_starts()[3]  # By 270 degrees about z.
+    starts = tuple(Candidate(s.index, s.euler_degrees, 0.9, 0.5, s.same_as) for s in euler_starts())
+    starts = (replace(starts[0], fitness=0.95), *starts[1:])
+    moved = replace(
+        alignment, search=Search.EULER64, candidates=starts, transform=make_transform(turn.rotation)
+    )
+    with canvas.styled():
+        figure = draw_alignment(one, check, "t", "s", moved)
+        axes = figure.axes[-1]
+        (tick,) = axes.get_xticks()
+        assert [text.get_text() for text in axes.get_xticklabels()] == ["start at 0°, 0°, 270°"]
+    marked = [
+        k for k, bar in enumerate(axes.patches) if bar.get_facecolor() == to_rgba(canvas.ACCENT)
+    ]
+    assert marked == [tick] and tick > 0
 
 
 @pytest.mark.usefixtures("sides")
