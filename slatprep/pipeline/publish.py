@@ -128,7 +128,8 @@ class Destination:
 
     def ranges_there(self, verb: str) -> dict[str, Normalization]:
         """Return the ranges of the existing store that `lost` found, for `moved_ranges`."""
-        return {f"the store that {verb} there": self.there.normalization} if self.there else {}
+        there = self.there  # Its length would be read, which may be damaged.
+        return {} if there is None else {f"the store that {verb} there": there.normalization}
 
     def publish(self) -> None:
         """Make the new version on an object store the current one."""
