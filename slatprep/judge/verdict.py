@@ -24,7 +24,7 @@ from slatprep.records import (
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The limits between verdicts; docs/quality.md says how they were chosen.
+    """The limits between verdicts; docs/design/confidence.md says how they were chosen.
 
     Attributes
     ----------
