@@ -14,7 +14,7 @@ from slatprep.cli import options
 from slatprep.cli.info import show_errors, show_quality
 from slatprep.cli.output import Output, say
 from slatprep.cli.signature import Click, command
-from slatprep.errors import amount, tally
+from slatprep.errors import amount
 from slatprep.workers import Progress
 
 if TYPE_CHECKING:
@@ -399,19 +399,12 @@ def subset(
     """
     if not (assets or chosen.verdicts or chosen.categories):
         raise click.UsageError("say which assets: --asset ID, --verdict or --category")
-    from slatprep.inspect.overview import list_assets
     from slatprep.pipeline.join import subset_store
 
-    wanted, opened = list(assets), options.opened(store)
-    options.note_numbered(output, opened, assets)
-    if chosen.verdicts or chosen.categories:
-        wanted += [asset.asset_id for asset in list_assets(opened, **vars(chosen))]
-        if not wanted:
-            there = tally(opened.column("verdict"))
-            raise click.UsageError(f"no asset of {store} is of that kind; there are {there}")
+    options.note_numbered(output, options.opened(store), assets)
     with output.progress("subset", "shards") as progress:
         summary = subset_store(
-            store, out, wanted, manifests=manifests, jobs=jobs, progress=progress
+            store, out, assets, **vars(chosen), manifests=manifests, jobs=jobs, progress=progress
         )
     report(output, summary)
 

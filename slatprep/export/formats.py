@@ -51,7 +51,7 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
 
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
-    wanted = store.with_verdicts(verdicts)
+    wanted = store.having(verdicts)
     rows = sorted({store.match(name) for name in words_of(assets)}) or range(len(store))
     chosen = sorted(store.ids[row] for row in rows if wanted[row])
     if not chosen:

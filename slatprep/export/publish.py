@@ -146,7 +146,7 @@ def card_of(
     `pictures` names the pictures beside the card. The data have only assets with one of
     `verdicts`; empty or ``all`` is all of them.
     """
-    kept = store.with_verdicts(verdicts)
+    kept = store.having(verdicts)
     title = stated.name or store.name.removesuffix(".zarr")
     shards = data.endswith(".tar")
     head: dict[str, Any] = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError
 from slatprep.judge import THRESHOLDS
-from slatprep.records import Normalization, Place, Verdict, words_of
+from slatprep.records import Normalization, Place, Verdict
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
 from slatprep.store.records import StoredRecords
@@ -132,26 +130,6 @@ class ListedAsset:
     reasons: tuple[str, ...]
 
 
-def rows_chosen(
-    store: Store, verdicts: Collection[str] = (), categories: Collection[str] = ()
-) -> list[int]:
-    """Return the rows of assets with these verdicts and categories; empty takes all.
-
-    Raises ConfigError if a verdict does not exist, or no asset has one of the categories.
-    """
-    categories, wanted = words_of(categories), store.with_verdicts(verdicts)
-    known = sorted(set(map(str, store.column("category"))))
-    for category in sorted(set(categories).difference(known)):
-        close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
-        expected = f"expected {', '.join(close)}" if close else "no category is known"
-        raise ConfigError(f"{store.path}: no asset has the category {category!r}; {expected}")
-    return [
-        row
-        for row, category in enumerate(store.column("category"))
-        if wanted[row] and (not categories or category in categories)
-    ]
-
-
 def list_assets(
     store: Store,
     verdicts: Collection[str] = (),
@@ -164,7 +142,8 @@ def list_assets(
     the store, or the record of an asset that is not good, cannot be read.
     """
     table, records, ids = store.table(), StoredRecords(store), store.ids
-    for row in sorted(rows_chosen(store, verdicts, categories), key=ids.__getitem__):
+    rows = np.flatnonzero(store.having(verdicts, categories)).tolist()
+    for row in sorted(rows, key=ids.__getitem__):
         verdict, confidence = str(table["verdict"][row]), float(table["confidence"][row])
         if max_confidence is not None and not confidence <= max_confidence:
             continue

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import require_one_of
-from slatprep.inspect.overview import UNKNOWN, rows_chosen
+from slatprep.inspect.overview import UNKNOWN
 from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
 from slatprep.records import Place, Verdict
 from slatprep.store import Store, open_store
@@ -202,7 +202,7 @@ def store_statistics(
     """
     require_one_of("weight", weight, get_args(Weight))
     store = open_store(store)
-    rows = rows_chosen(store, verdicts, categories)
+    rows = np.flatnonzero(store.having(verdicts, categories)).tolist()
     column = [str(category) for category in store.column("category")]
     verdict_of = [str(verdict) for verdict in store.column("verdict")]
     # Sort by category, so that only one category's tally is in memory at a time.

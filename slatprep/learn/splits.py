@@ -47,7 +47,7 @@ def select_assets(
     """
     if split is not None:
         require_one_of("split", split, SPLITS)
-    chosen = store.with_verdicts(verdicts) & (store.column("valid_share") > 0)
+    chosen = store.having(verdicts) & (store.column("valid_share") > 0)
     if max_ambiguity is not None:
         chosen &= store.column("ambiguity") <= max_ambiguity
     if split is not None:

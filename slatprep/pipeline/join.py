@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import orjson
 
-from slatprep.errors import ConfigError, StoreError
+from slatprep.errors import ConfigError, StoreError, tally
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.notices import moved_ranges
 from slatprep.pipeline.pack import pack_store
@@ -44,8 +44,10 @@ _ROWS_A_JOB = 256
 def subset_store(
     store: Store | str | Place,
     out: str | Place,
-    assets: Iterable[str | int],
+    assets: Iterable[str | int] = (),
     *,
+    verdicts: Collection[str] = (),
+    categories: Collection[str] = (),
     manifests: str | Place | None = None,
     jobs: Jobs = 1,
     progress: Progress | None = None,
@@ -62,6 +64,9 @@ def subset_store(
         The new store, a path or URL; an existing one is replaced in one step.
     assets : str, or iterable of str or int
         Ids, unique beginnings of ids, or numbers; see `Store.match`.
+    verdicts, categories : str or collection of str
+        Take also the assets that have one of the verdicts and one of the categories, whichever is
+        given; the verdict ``all`` takes every asset.
     manifests : str or Path, optional
         Folder of its records; by default beside it.
     jobs : int or Workers
@@ -84,9 +89,14 @@ def subset_store(
     source = _source(store)
     everything = _rows([source])
     chosen = {source.match(name) for name in words_of(assets)}
+    if verdicts or categories:
+        chosen |= set(np.flatnonzero(source.having(verdicts, categories)).tolist())
     rows = in_order([everything[row] for row in chosen], None, compact=True)
     if not rows:
-        raise ConfigError(f"no asset of {source.path} is chosen; expected one at least")
+        there = tally(source.column("verdict"))
+        raise ConfigError(
+            f"no asset of {source.path} is chosen; expected one at least: there are {there}"
+        )
     place, parameters = Destination(out, manifests), _parameters([source], source.build)
     how = source.normalization, source.contents, source.build, parameters.store
     return _write(NextStore(rows, (source,), *how), parameters, place, jobs, progress)

@@ -162,7 +162,7 @@ def shared_sources(
     if groups:
         names = [" = ".join(ids[at] for at in own[:4]) for own in groups]
         yield (
-            f"{sum(map(len, groups))} assets of different objects have one {what} "
+            f"{sum(map(len, groups))} assets of different objects share the same {what} "
             f"({_first(names)}): see whether a map or a copy gave it to both"
         )
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError, UnknownAssetError, amount, require_one_of
+from slatprep.errors import ConfigError, StoreError, UnknownAssetError, amount, require_one_of
 from slatprep.records import Contents, Normalization, Place, Verdict, words_of
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import connected
@@ -215,16 +215,26 @@ class AssetTable:
         """
         return match_id(name, self._index, self.path, self._listing)
 
-    def with_verdicts(self, verdicts: Collection[str]) -> NDArray[np.bool_]:
-        """Return which assets (A,) have one of the verdicts; ``all``, or none, takes every asset.
+    def having(
+        self, verdicts: Collection[str] = (), categories: Collection[str] = ()
+    ) -> NDArray[np.bool_]:
+        """Return which assets (A,) have one of the verdicts, and one of the categories.
 
-        ConfigError for an unknown word.
+        None takes all, and so does the verdict ``all``. Raises ConfigError if a verdict does not
+        exist, or no asset has one of the categories.
         """
-        words = words_of(verdicts)
-        for one in words:
+        verdicts, categories = words_of(verdicts), words_of(categories)
+        for one in verdicts:
             require_one_of("verdict", one, (*Verdict, "all"))
-        every = not words or "all" in words
-        return np.isin(self.column("verdict").astype(str), list(Verdict if every else words))
+        own = self.column("category").astype(str)
+        known = sorted(set(own.tolist()))
+        for category in sorted(set(categories).difference(known)):
+            close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
+            expected = f"expected {', '.join(close)}" if close else "no category is known"
+            raise ConfigError(f"{self.path}: no asset has the category {category!r}; {expected}")
+        every = not verdicts or "all" in verdicts
+        judged = np.isin(self.column("verdict").astype(str), list(Verdict if every else verdicts))
+        return judged & np.isin(own, list(categories or known))
 
     @property
     def _listing(self) -> str:

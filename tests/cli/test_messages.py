@@ -125,7 +125,7 @@ def test_no_default_is_printed_of_an_option_that_is_empty_without_it():
 
 def test_a_choice_that_leaves_nothing_says_what_there_is(store, tmp_path):
     told = refused("subset", store, "--verdict", "failed", "--out", tmp_path / "s.zarr")
-    assert f"no asset of {store} is of that kind; there are 5 good" in told
+    assert f"no asset of {store} is chosen; expected one at least: there are 5 good" in told
 
 
 def test_names_that_were_looked_for_are_told_once(make_dataset, tmp_path):

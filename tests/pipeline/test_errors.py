@@ -63,8 +63,10 @@ def test_pairs_that_share_a_slat_or_a_grid_are_no_decoys(make_dataset, tmp_path)
     pairs = {(one.grid, one.slat) for one in measure_errors(open_store(out), decoys=9).decoys}
     assert len(pairs) == 4
     assert not pairs & {("a", "b"), ("b", "a"), ("c", "d"), ("d", "c")}
-    shared = "have one SLAT (a = b)"
+    shared = "share the same SLAT (a = b)"
     assert shared in run("info", out).output and shared in run("list", out).output
+    run("report", out, "--out", tmp_path / "page.html")
+    assert shared in (tmp_path / "page.html").read_text()
     run("subset", out, "--asset", "a", "--asset", "b", "--out", tmp_path / "two.zarr")
     said = run("measure-errors", tmp_path / "two.zarr", code=1).output
     assert "decoys need two objects that share neither grid nor SLAT" in said

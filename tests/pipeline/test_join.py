@@ -74,6 +74,22 @@ def test_a_text_is_one_asset_and_nothing_is_no_place(folder, tmp_path):
         subset_store(folder / "abcd.zarr", None, ["d"])  # type: ignore[arg-type]
 
 
+def test_a_subset_by_verdict_or_category_is_that_of_the_command(copy, tmp_path):
+    rewrite(copy, "asset/verdict", slice(1, 3), np.array(["failed", "doubtful"], dtype=object))
+    rewrite(copy, "asset/category", 0, "a kind")
+    ids = open_store(copy).ids
+    subset_store(copy, tmp_path / "s.zarr", verdicts="failed", categories=())
+    assert open_store(tmp_path / "s.zarr").ids == ids[1:2]
+    subset_store(copy, tmp_path / "s.zarr", [2], verdicts=["good"], categories="a kind")
+    assert open_store(tmp_path / "s.zarr").ids == [ids[0], ids[2]]
+    run("subset", copy, "--asset", ids[2], "--verdict", "good", "--category", "a kind",
+        "--out", tmp_path / "t.zarr")  # fmt: skip
+    assert tree(tmp_path / "t.zarr") == tree(tmp_path / "s.zarr")
+    for wrong in ({"verdicts": "fine"}, {"categories": ["none"]}, {}):
+        with pytest.raises(ConfigError, match="expected"):
+            subset_store(copy, tmp_path / "s.zarr", **wrong)
+
+
 def test_joined_stores_are_the_build_of_all_their_assets(folder, tmp_path):
     concat_stores([open_store(folder / "bd.zarr"), folder / "ac.zarr"], tmp_path / "all.zarr")
     assert tree(tmp_path / "all.zarr") == tree(folder / "abcd.zarr")

@@ -67,8 +67,10 @@ def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
     asset = dataset.assets["a"]
     dataset.write_slat("c.npz", asset.coords, asset.feats)
     warnings = build_store(dataset.parameters(), tmp_path / "s.zarr").warnings
-    assert any("2 assets of different objects have one SLAT (a = c)" in text for text in warnings)
-    assert any("have one grid (a = e" in text for text in warnings)
+    assert any(
+        "2 assets of different objects share the same SLAT (a = c)" in text for text in warnings
+    )
+    assert any("share the same grid (a = e" in text for text in warnings)
 
 
 def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):

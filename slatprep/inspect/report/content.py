@@ -24,6 +24,8 @@ from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.pipeline.decoys import measured_errors, told_of
+from slatprep.pipeline.notices import shared_sources
+from slatprep.pipeline.rows import slat_contents
 from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Place, Status
 from slatprep.store.reader import Store
 from slatprep.store.record import AssetRecord, BuildRecord, FailedRecord
@@ -184,6 +186,7 @@ def page_content(
         "properties": _properties(store, tallies, clipped=built is not None),
         "balance": _balance(store, tallies),
         "assets": _table(store, built.failed if built else (), told, listed, drawn),
+        "shared": list(shared_sources(store, "SLAT", slat_contents(store))),
         "all": {
             "stored": len(store),
             "assets": sum(states.values()),

@@ -207,6 +207,7 @@ def test_of_a_store_too_large_to_list_a_sample_is_listed(hostile, page, tmp_path
     expected = {"stored": 5, "assets": 7, "states": states, "ambiguous": ambiguous,
                 "unusual": 1}  # fmt: skip
     assert found["all"] == whole["all"] == expected
+    assert found["shared"] == []
     clips = [[one["clipped"] for one in content["properties"]] for content in (found, whole)]
     assert clips[0] == clips[1]
 

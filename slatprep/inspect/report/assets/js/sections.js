@@ -39,6 +39,7 @@ const Sections = (() => {
     if (unusual) {
       byId("statelist").append(el("button", { type: "button", class: "chip", title: "values, masks, places or latents that few sources have", onclick: () => filter.only("unusual", true) }, `⚠ unusual ${Format.count(unusual)}`));
     }
+    byId("statelist").append(...CONTENT.shared.map((line) => el("p", { class: "hint", style: { flex: "1 0 100%" } }, `⚠ ${line}`)));
     why(filter);
   }
 
