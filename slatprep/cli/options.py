@@ -15,7 +15,7 @@ import click
 
 from slatprep.cli.output import Output, new_file
 from slatprep.cli.signature import Click, NewPath
-from slatprep.errors import tally
+from slatprep.errors import amount, tally
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -442,11 +442,14 @@ def split_of_objects(
             "small dataset; --split-by FILE takes lists of your own"
         )
     for ids, what in (
-        (assignment.unknown, "are of no object of the store that has a valid voxel"),
-        (assignment.unlisted, "of the store are in none of its lists, and left out"),
+        (assignment.unknown, "without an object of the store that has a valid voxel"),
+        (assignment.unlisted, "of the store in none of its lists, and left out"),
     ):
         if ids:
-            output.note(f"note:    {len(ids):,} ids {what}: {', '.join(ids[:3])[:200]} ...")
+            more = " ..." if len(ids) > 3 else ""
+            output.note(
+                f"note:    {amount(len(ids), 'id')} {what}: {', '.join(ids[:3])[:200]}{more}"
+            )
     return assignment.splits
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from slatprep.align.consensus import find_consensus, is_common, settle, turn_if_likelier
 from slatprep.align.settle import refit, take
+from slatprep.errors import amount
 from slatprep.judge import contradicted, witness
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.annotate import look_up
@@ -96,8 +97,8 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
 
     crew.tell(
         f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "
-        f"rotation; {moved(tied):,} of {len(tied):,} ties were given another placement by it, and "
-        f"{moved(turned):,} of {len(turned):,} assets that were turned otherwise without a tie"
+        f"rotation; it gave another placement to {moved(tied):,} of {amount(len(tied), 'tie')}, "
+        f"and to {moved(turned):,} of {amount(len(turned), 'asset')} turned otherwise without a tie"
     )
     return [changed.get(asset.asset_id, asset) for asset in assets]
 
@@ -192,12 +193,16 @@ def _told(
 ) -> str:
     """Say how reliable latents are, and what they decided."""
     agreeing, good = reliability.agreeing, reliability.witnesses
-    fit = f"the latents of {agreeing:,} of {good:,} good assets fit their own labels best"
+    fit = (
+        f"of {amount(good, 'good asset')} that could be compared with wrong labels, the latents of "
+        f"{agreeing:,} fit their own best"
+    )
     if not reliability.factor:
         return f"witness: {fit}; too few, so latents are not used"
     decided = [choice[0] for choice in choices if choice]
     moved = sum(number > 0 for number in decided)
     return (
-        f"witness: {fit}; of {len(decided):,} ties that latents decide {moved:,} were given "
-        f"another placement; they contradict the labels of {contradicted:,} assets"
+        f"witness: {fit}; latents decide {amount(len(decided), 'tie')}, of which "
+        f"{moved:,} took another placement; they contradict the labels of "
+        f"{amount(contradicted, 'asset')}"
     )

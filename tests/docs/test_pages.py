@@ -23,7 +23,7 @@ from nbclient import NotebookClient
 from scipy.spatial import cKDTree
 from support.commands import parse_command
 from support.installed import package
-from support.synthetic import make_asset
+from support.synthetic import Dataset, make_asset
 
 from slatprep import build_store, load_parameters, open_store
 from slatprep.cli.commands import COMMANDS, slatprep
@@ -33,6 +33,7 @@ from slatprep.parameters import BuildParameters
 from slatprep.readers import adapters
 from slatprep.readers.voxels import _parsed
 from slatprep.store.layout import ARRAYS, MERGED
+from slatprep.store.records import StoredRecords
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -230,6 +231,25 @@ def test_configuration_lists_every_key_with_its_default():
         for field in dataclasses.fields(hints[group.name]):
             assert next(documented) == (field.name, default_of(field)), group.name
     assert list(documented) == []
+
+
+def test_two_folders_are_read_by_the_definition_that_is_shown(tmp_path):
+    for number, name in enumerate(("first", "second")):
+        dataset = Dataset(tmp_path / name).having(f"{name}-cup", seed=number)
+        mask = dataset.assets[f"{name}-cup"].grid[..., 3] != 7
+        np.save(tmp_path / name / f"pixieverse/{name}-cup/clip_features_mask.npy", mask)
+    _, folders, ranges = (text for kind, text in blocks("configuration.md") if kind == "toml")
+    (tmp_path / "ranges.toml").write_text(ranges)
+    config = tmp_path / "dataset.toml"
+    more = f'\n[normalize]\nranges = "{tmp_path / "ranges.toml"}"\n'
+    config.write_text(folders.replace("/data", str(tmp_path)) + more)
+    store = tmp_path / "s.zarr"
+    assert build_store(load_parameters(config), store).problems == ()
+    opened = open_store(store)
+    assert opened.ids == ["first-cup", "second-cup"]
+    assert [(one.lo, one.hi) for one in opened.normalization.ranges] == [(3, 12), (1, 4), (0, 0.5)]
+    roles = {source.role for source in StoredRecords(opened).of("second-cup").sources}
+    assert "mask" in roles
 
 
 def default_of(field: dataclasses.Field[object]) -> str:

@@ -367,8 +367,8 @@ def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, tmp_path):
     command = ("train", learn_store, "--out", out, *FAST, "--epochs", "1", "--split-by", lists)
     told = run(*command).stderr
     assert "3 train, 1 val, 2 test" in told
-    assert "1 ids are of no object" in told and "nobody" in told
-    assert "2 ids of the store are in none" in told
+    assert "1 id without an object of the store that has a valid voxel: nobody\n" in told
+    assert "2 ids of the store in none" in told
     kept = json.loads((out / "splits.json").read_text())
     assert kept == {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h"]}
     assert json.loads((out / "run.json").read_text())["split_by"] == str(lists)

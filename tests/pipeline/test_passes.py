@@ -10,6 +10,7 @@ import zarr
 from support.trees import copied, inodes, records_beside, tree
 
 from slatprep import load_parameters, make_demo, open_store, subset_store
+from slatprep.errors import amount
 from slatprep.inspect.check import check_alignment
 from slatprep.inspect.score import score_against_truth
 from slatprep.inspect.verify import verify_store
@@ -201,8 +202,8 @@ def test_ties_that_change_labels_are_settled_right_and_recorded(telling, stores)
     moved = sum(heard[k]["alignment"]["transform"] != alone[k]["alignment"]["transform"]
                 for k in settled)  # fmt: skip
     told = (root / "told").read_text()
-    assert f"of {len(settled)} ties that latents decide {moved} were given another" in told
-    assert told.endswith("contradict the labels of 1 assets")
+    assert f"latents decide {amount(len(settled), 'tie')}, of which {moved} took another" in told
+    assert told.endswith("contradict the labels of 1 asset")
 
 
 def test_assets_without_a_tie_keep_every_byte_but_those_that_are_contradicted(telling, stores):
@@ -260,7 +261,7 @@ def test_latents_that_carry_nothing_change_nothing(habitual, agreed, tmp_path):
     heard = copied(agreed[0], tmp_path / "heard.zarr")
     summary = build_store(replace(habitual[1], witness=HEARD), heard, note=told.append)
     assert summary.contradicted == ()
-    assert "fit their own labels best; too few, so latents are not used" in told[-1]
+    assert "fit their own best; too few, so latents are not used" in told[-1]
     assert all(record["first_pass"] is None for record in records_beside(heard).values())
     for row in range(len(open_store(heard))):
         assert_same_labels((agreed[0], heard), row)

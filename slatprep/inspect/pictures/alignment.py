@@ -232,8 +232,9 @@ def _figures(figure: Figure, check: AlignmentCheck, scene: Scene, left: float, y
         colour = canvas.VERDICT_COLOURS["failed"] if worse else canvas.INK
         unit = " [voxel]" if one.name.startswith("inlier_rmse") else ""
         canvas.write(figure, columns[0], line, f"{one.name}{unit}", size=7.5)
-        # Adding 0 turns a rounded -0 into 0.
-        value = "-" if np.isnan(one.value) else f"{round(one.value, 3) + 0.0:.3f}"
+        # As the table has it; adding 0 turns -0 into 0.
+        form = ".1e" if 0 < abs(one.value) < 5e-4 else ".3f"
+        value = "-" if np.isnan(one.value) else f"{one.value + 0.0:{form}}"
         canvas.write(figure, columns[1], line, value, size=7.5, ha="right", color=colour)
         limit = one.threshold_text.replace(">=", "\u2265").replace("<=", "\u2264")
         canvas.note(figure, columns[2] - 26, line, limit, 7.5, ha="right")
