@@ -193,10 +193,7 @@ def _told(
 ) -> str:
     """Say how reliable latents are, and what they decided."""
     agreeing, good = reliability.agreeing, reliability.witnesses
-    fit = (
-        f"of {amount(good, 'good asset')} that could be compared with wrong labels, the latents of "
-        f"{agreeing:,} fit their own best"
-    )
+    fit = f"{agreeing:,} of {good:,} good assets to compare have latents that fit their labels best"
     if not reliability.factor:
         return f"witness: {fit}; too few, so latents are not used"
     decided = [choice[0] for choice in choices if choice]

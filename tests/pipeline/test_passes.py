@@ -261,7 +261,7 @@ def test_latents_that_carry_nothing_change_nothing(habitual, agreed, tmp_path):
     heard = copied(agreed[0], tmp_path / "heard.zarr")
     summary = build_store(replace(habitual[1], witness=HEARD), heard, note=told.append)
     assert summary.contradicted == ()
-    assert "fit their own best; too few, so latents are not used" in told[-1]
+    assert "fit their labels best; too few, so latents are not used" in told[-1]
     assert all(record["first_pass"] is None for record in records_beside(heard).values())
     for row in range(len(open_store(heard))):
         assert_same_labels((agreed[0], heard), row)
