@@ -6,14 +6,14 @@ slatprep's own, stop other assets, or get into a store.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import orjson
+from annotated_types import MaxLen, MinLen
 
 from slatprep import records
 from slatprep.errors import InputError, SlatprepError
@@ -21,26 +21,17 @@ from slatprep.geometry.frames import split_transform
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.values import require_plausible
-from slatprep.records.sources import ROLES
+from slatprep.records.json_types import Count
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
+from slatprep.storage.documents import read_as
 from slatprep.storage.files import Listing
 
-_MOST_LETTERS, _MOST_COUNT, _MOST_TOLD = 4096, 2**53, 1000
-"""Most letters of a text in a record, the largest integer that every reader of JSON keeps, and the
-most bytes of an adapter's text in an error."""
+_MOST_TOLD = 1000
+"""Most bytes of an adapter's text in an error."""
 
-_DIGEST = re.compile("[0-9a-f]{64}")
-
-
-def _is_text(value: object) -> bool:
-    """Return whether a record can hold a value as a text: not too long, and without surrogates."""
-    if not (isinstance(value, str) and len(value) <= _MOST_LETTERS):
-        return False
-    return not any("\ud800" <= letter <= "\udfff" for letter in value)
-
-
-def _is_count(value: object) -> bool:
-    return type(value) is int and 0 <= value <= _MOST_COUNT
+_FILES = Annotated[tuple[records.SourceFile, ...], MinLen(1)]
+_TEXTS = tuple[Annotated[str, MaxLen(4096)], ...]
+_Read = TypeVar("_Read", records.MaterialField, records.StructuredLatents)
 
 
 @dataclass(frozen=True)
@@ -79,18 +70,16 @@ class _Foreign:
                 f"{name} as {got.dtype} {got.shape}; expected {dtype.__name__} {shape}, not empty",
             )
 
-    def _require_told(self, of: records.MaterialField | records.StructuredLatents) -> None:
-        """Require that files and notes have types that a record can hold."""
-        known = all(isinstance(one, records.SourceFile) for one in of.sources)
-        self._require(known and of.sources, "no `sources`, the files that it read")
-        for one in of.sources:
-            self._require(_is_text(one.path), f"{one.path!r} as the path of a file")
-            self._require(_is_count(one.size), f"{one.size!r} as the size of a file")
-            self._require(one.role in ROLES, f"{one.role!r} as the role of a file")
-            self._require(_is_count(one.source), f"{one.source!r} as the number of a source")
-            is_digest = isinstance(one.sha256, str) and _DIGEST.fullmatch(one.sha256)
-            self._require(is_digest, f"{one.sha256!r} as the SHA-256 of a file")
-        self._require(all(map(_is_text, of.warnings)), "warnings that are no text")
+    def _as_recorded(self, read: _Read, **kinds: Any) -> _Read:
+        """Return what was read, with files, notes and entries of these kinds as in a record."""
+        held = {}
+        for name, kind in {"sources": _FILES, "warnings": _TEXTS, **kinds}.items():
+            try:
+                held[name] = read_as(kind, orjson.dumps(getattr(read, name)))
+            except (TypeError, ValueError) as error:
+                reason = " ".join(str(error).split())
+                raise self._fault(f"gives {name} that no record can hold: {reason}") from None
+        return replace(read, **held)
 
 
 class ForeignSource(_Foreign):
@@ -171,9 +160,7 @@ class ForeignSource(_Foreign):
                 split_transform(frame)
             except ValueError as error:
                 raise self._fault(f"gives a frame that is refused: {error}") from None
-            self._require(_is_count(field.unphysical), f"{field.unphysical!r} unphysical voxels")
-            orjson.dumps(field.bounds)
-            self._require_told(field)
+            field = self._as_recorded(field, unphysical=Count, bounds=Any)
         where, classes = pair.grid or pair.roots.pixieverse, contents.classes
         values, material = field.properties.copy(), field.material if field.classified else None
         told = require_plausible(where, values, material, table, classes, pair.roots)
@@ -217,5 +204,4 @@ class ForeignLatents(_Foreign):
             self._require(np.isfinite(read.feats).all(), "feats that are not finite")
             told = f"{read.standardised!r} for whether they are standardised"
             self._require(type(read.standardised) is bool, told)
-            self._require_told(read)
-            return read
+            return self._as_recorded(read)
