@@ -151,12 +151,14 @@ BAD = {
         "", "{", "{}", "[" * 100_000, '{"a":' * 100_000, "- 1", "density_p1: [1, 2]",
         "density_p1: !!python/object/apply:os.system [ls]", changed(nu_min="0.2"),
         changed(nu_min=math.nan), changed(nu_max=math.inf), changed(E_max=10**400),
-        changed(E_min=True), changed(nu_min=0.5), changed(E_min=None),
+        changed(E_min=True), changed(nu_min=0.5), changed(E_min=None), changed(nu_p1=0.2),
+        changed(nu_p99=0.3), changed(density_min=1000.0, density_max=8000.0),
     ],
     "ranges.toml": [
         "", "not toml at all", "youngs_modulus = 3\n", f"{MODULUS}lo = true\nhi = 4\n",
         f"{MODULUS}lo = -1e308\nhi = 1e308\n", f"{MODULUS}lo = 3\nhi = 3\n",
-        f"{MODULUS}lo = 3\nhi = inf\n", f"{MODULUS}lo = '3'\nhi = 4\n",
+        f"{MODULUS}lo = 3\nhi = inf\n", f"{MODULUS}lo = 3\nhi = 1e11\n",
+        f"{MODULUS}lo = '3'\nhi = 4\n",
     ],
 }  # fmt: skip
 

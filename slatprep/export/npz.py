@@ -170,7 +170,10 @@ def write_voxels(points: Points, directory: Path, asset: StoredAsset) -> Exporte
     """Write ``voxels/<id>_with_materials.npz`` of an asset."""
     there = annotated_points(asset, points)
     modulus, density, ratio = there.solid(asset).T
-    labels = np.array(asset.store.contents.labels, dtype="<U32")[there.material]
-    rows = np.rec.fromarrays([*there.in_slat.T, modulus, ratio, density, labels], VOXEL)
+    names = np.array(asset.store.contents.labels)
+    # As wide as VoMP's own, unless a name is longer; cut names could become equal.
+    named = np.dtype([*VOXEL.descr[:-1], ("segment_id", np.promote_types("<U32", names.dtype))])
+    columns = [*there.in_slat.T, modulus, ratio, density, names[there.material]]
+    rows = np.rec.fromarrays(columns, named)
     name = f"{FOLDER}/{file_name(asset.asset_id)}_with_materials.npz"
     return _write(directory, name, asset, len(rows), {"voxel_data": rows})

@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError, tally
+from slatprep.normalize import ranges_from_bounds, ranges_from_extents
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.notices import moved_ranges
 from slatprep.pipeline.pack import pack_store
@@ -25,7 +27,7 @@ from slatprep.pipeline.publish import BuildSummary, Destination, publish_build
 from slatprep.pipeline.rows import NextStore, Row, SourceStore, in_order
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside
-from slatprep.records import Contents, LatentSpace, Normalization, Place, PropertyRange, words_of
+from slatprep.records import Contents, LatentSpace, Normalization, Place, words_of
 from slatprep.storage.documents import read_as
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
@@ -276,11 +278,18 @@ def _common_ranges(sources: Sequence[SourceStore]) -> Normalization:
                 f"{source.path} has ranges from {one.source!r}, not those of the others; "
                 "expected the same in all, or in each those of its dataset: build with --ranges"
             )
-    spans = (
-        PropertyRange(same[0].name, same[0].log10, min(r.lo for r in same), max(r.hi for r in same))
-        for same in zip(*(one.ranges for one in ranges), strict=True)
-    )
-    return Normalization(tuple(spans), "dataset")
+    bounds = np.array([_bounds(source) for source in sources])
+    lo, hi = bounds[:, :, 0].min(axis=0), bounds[:, :, 1].max(axis=0)
+    return ranges_from_bounds(lo, hi, "dataset", sources[0].contents.properties)
+
+
+def _bounds(source: SourceStore) -> NDArray[np.float64]:
+    """Return the bounds (P, 2) of a store's ranges, without the width given to a single value."""
+    extents = source.column("extent")
+    own = ranges_from_extents(extents, "dataset", source.contents.properties).ranges
+    extent = zip(extents[:, :, 0].min(axis=0), extents[:, :, 1].max(axis=0), strict=True)
+    held = zip(source.normalization.ranges, own, extent, strict=True)
+    return np.array([ends if one == same else (one.lo, one.hi) for one, same, ends in held])
 
 
 def _in_words(space: LatentSpace) -> str:

@@ -19,6 +19,9 @@ _MAX_BYTES = 2**20
 # Larger than any bound in log10, and small enough that normalising does not overflow.
 _MAX_BOUND = 1e6
 
+# Float32, which sources and stores hold, has values of 1e-45 to 3e38.
+_MAX_LOG10 = 50.0
+
 # Names of PROPERTY_COLUMNS in Pixie's file.
 _PIXIE_WORDS = ("E", "density", "nu")
 
@@ -34,8 +37,9 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
         hi = 11.0
 
     Pixie's file has ``density_p1``, ``density_p99``, ``E_p1``, ``nu_p1`` and so on in the same
-    units, as JSON or in lines. If these are missing, ``density_min``, ``density_max`` and so on
-    are read. ConfigError if the file cannot be read, lacks a property or has an empty range.
+    units, as JSON or in lines. Where both percentiles of a property are missing, ``density_min``
+    and ``density_max`` and so on are read. ConfigError if the file cannot be read, lacks a property
+    or one of two percentiles, or has an empty range or log10 that no float32 has.
     """
     try:
         text = read_bounded(path, _MAX_BYTES).decode()
@@ -49,10 +53,12 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
     for name, log10 in ((one.name, one.log10) for one in properties):
         entry = table.get(name) if isinstance(table, dict) else None
         lo, hi = (entry.get(k) if isinstance(entry, dict) else None for k in ("lo", "hi"))
-        if not _is_number(lo) or not _is_number(hi) or lo >= hi:
+        most = _MAX_LOG10 if log10 else _MAX_BOUND
+        if not _is_number(lo, most) or not _is_number(hi, most) or lo >= hi:
+            mapped = f" in log10 of the SI value, at most {most:g}" if log10 else ""
             raise ConfigError(
                 f"{path}: {name} has lo = {lo!r} and hi = {hi!r}; expected a table [{name}] with "
-                f"finite lo < hi{' in log10 of the SI value' if log10 else ''}"
+                f"finite lo < hi{mapped}"
             )
         ranges.append((float(lo), float(hi)))
     return normalization_of(np.array(ranges), path.name, properties)
@@ -85,16 +91,18 @@ def _of_pixie(text: str) -> dict[str, dict[str, object]]:
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
         pairs = (line.partition(":") for line in lines if line not in ("", "---"))
         numbers = unique([(name.strip(), float(value)) for name, _, value in pairs])
-    return {
-        name: {
-            end: numbers.get(f"{word}_{percentile}", numbers.get(f"{word}_{limit}"))
-            for end, percentile, limit in (("lo", "p1", "min"), ("hi", "p99", "max"))
-        }
-        for name, word in zip(PROPERTY_COLUMNS, _PIXIE_WORDS, strict=True)
-    }
+    tables = {}
+    for name, word in zip(PROPERTY_COLUMNS, _PIXIE_WORDS, strict=True):
+        percentiles, limits = (f"{word}_p1", f"{word}_p99"), (f"{word}_min", f"{word}_max")
+        given = [key for key in percentiles if key in numbers]
+        if len(given) == 1:
+            raise ValueError(f"of {' and '.join(percentiles)} only {given[0]} is there")
+        lo, hi = map(numbers.get, percentiles if given else limits)
+        tables[name] = {"lo": lo, "hi": hi}
+    return tables
 
 
-def _is_number(value: object) -> TypeGuard[float]:
+def _is_number(value: object, most: float) -> TypeGuard[float]:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
-    return abs(value) <= _MAX_BOUND  # NaN is not
+    return abs(value) <= most  # NaN is not

@@ -1,6 +1,7 @@
 """Files of an asset are read as their users read them: TRELLIS's data set, VoMP, Pixie, Open3D."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import plyfile
 import pytest
 from support.commands import refused, run
 from support.exports import hold_truth, index_of
-from support.made_store import edit_record, rewrite
+from support.made_store import edit_attributes, edit_record, rewrite
 from support.raw_sources import field_at
 from support.synthetic import JELLY, METAL, QUARTER_TURN, MakeDataset
 
@@ -110,6 +111,17 @@ def load_materials(path: Path) -> tuple[np.ndarray, np.ndarray]:
     where = np.stack([voxels[axis] for axis in ("x", "y", "z")], axis=1)
     what = [voxels[name] for name in ("youngs_modulus", "poissons_ratio", "density")]
     return where, np.stack(what, axis=1)
+
+
+def test_names_of_classes_are_not_cut(store, tmp_path):
+    other = Path(shutil.copytree(store, tmp_path / "s.zarr"))
+    names = [f"{'wood that is hard ' * 3}{k}" for k in range(7)]
+    edit_attributes(other, material_classes=names)
+    export_store(other, tmp_path / "vomp", "voxel_data", assets=["cup"])
+    (path,) = (tmp_path / "vomp").rglob("*.npz")
+    asset = open_store(other)["cup"]
+    written = np.load(path)["voxel_data"]["segment_id"]
+    np.testing.assert_array_equal(written, np.array(names)[asset.material[asset.valid]])
 
 
 def test_the_loader_of_vomp_finds_every_voxel_and_its_material(store, mixed, tmp_path):

@@ -129,6 +129,26 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path
             concat_stores([tmp_path / "a.zarr", lost], tmp_path / "all.zarr")
 
 
+def test_one_value_of_a_store_is_a_point_in_the_ranges_of_all(make_dataset, tmp_path):
+    whole = make_dataset("a", "b")
+    for number, object_id in enumerate("ab"):
+        part = Dataset(tmp_path / object_id).having(object_id, seed=number)
+        grid = part.assets[object_id].grid
+        occupied = grid[..., 3] != 7
+        ratios = np.linspace(0.3, 0.34, occupied.sum()) if number else 0.3
+        grid[occupied, 2] = ratios
+        for dataset in (part, whole):
+            dataset.write_grid(object_id, grid)
+        build_store(part.parameters(), tmp_path / f"{object_id}.zarr")
+    build_store(whole.parameters(), tmp_path / "whole.zarr")
+    assert open_store(tmp_path / "a.zarr").normalization.ranges[2].hi == pytest.approx(0.8)
+    concat_stores([tmp_path / "a.zarr", tmp_path / "b.zarr"], tmp_path / "all.zarr")
+    joined, built = open_store(tmp_path / "all.zarr"), open_store(tmp_path / "whole.zarr")
+    assert joined.normalization == built.normalization
+    for one, other in zip(joined, built, strict=True):
+        np.testing.assert_allclose(one.properties, other.properties, atol=1e-5)
+
+
 def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):
     ac, out, other = folder / "ac.zarr", tmp_path / "out.zarr", make_dataset("x")
     build_store(other.parameters(), tmp_path / "x.zarr")
