@@ -16,6 +16,7 @@ def main() -> None:
     # workers inherit them.
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
+    os.environ["MPLBACKEND"] = "Agg"  # All pictures are files, and matplotlib fails at other names.
     # Batch systems stop jobs with SIGTERM, which must clean up and exit like Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from slatprep.cli.streams import prepare_streams

@@ -44,8 +44,8 @@ class FormatOptions:
     shard_size
         webdataset: assets per shard. [default: 256]
     latent_model : NAME
-        npz: the encoder's name, latent_model in TRELLIS's configurations. [default: that of
-        TRELLIS's published configurations]
+        npz: the encoder's name, latent_model in TRELLIS's configurations. [default: theirs for
+        latents of TRELLIS, else the store's name of the encoder]
     size : METRES
         usd: width of the unit cube. [default: 1]
     materials

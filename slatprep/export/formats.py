@@ -126,8 +126,9 @@ class ExportOptions:
         PLY: the unit cube of the SLAT, or PixieVerse's world coordinates.
     shard_size : int
         WebDataset: assets in one shard.
-    latent_model : str
-        npz: the encoder's name, by which TRELLIS's dataset finds the latents.
+    latent_model : str, optional
+        npz: the encoder's name, by which TRELLIS's dataset finds the latents. By default
+        `TRELLIS_ENCODER` for TRELLIS's latents, else the store's name of the encoder.
     size : float
         USD: width of the unit cube [m].
     materials : int
@@ -137,7 +138,7 @@ class ExportOptions:
     points: Points | None = None
     frame: Frame = "slat"
     shard_size: int = 256
-    latent_model: str = TRELLIS_ENCODER
+    latent_model: str | None = None
     size: float = 1.0
     materials: int = 64
 

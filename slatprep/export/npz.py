@@ -26,6 +26,7 @@ from slatprep.errors import ConfigError
 from slatprep.export.formats import (
     ROWS,
     TARGETS,
+    TRELLIS_ENCODER,
     Exported,
     ExportOptions,
     Points,
@@ -34,6 +35,7 @@ from slatprep.export.formats import (
     describe_columns,
     one_by_one,
 )
+from slatprep.records import TRELLIS
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
 from slatprep.store.layout import MERGED_COLUMNS
@@ -49,7 +51,9 @@ def trellis(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
 
     Raises ConfigError if the model's name cannot name a folder.
     """
-    model = options.latent_model
+    encoder, model = store.contents.latents.encoder, options.latent_model
+    if model is None:
+        model = TRELLIS_ENCODER if encoder == TRELLIS.encoder else encoder
     if not model or model != file_name(model):
         raise ConfigError(
             f"latent_model is {model!r}; expected an encoder's name, of letters, digits, . _ and -"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
 from numba import njit
+from numba.core.caching import FunctionCache
 
 
 def _can_be_kept() -> bool:
@@ -22,4 +25,22 @@ Numba uses the first writable folder of NUMBA_CACHE_DIR, ``__pycache__`` beside 
 user's cache. It refuses to cache if there is none, as in a container with a read-only root.
 """
 
-kernel = partial(njit, cache=KEPT)
+
+class _KeptIfPossible(FunctionCache):
+    """Numba's cache of a function, where a full disk costs only the next process time."""
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function with options of Numba."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = njit(**options)(function)
+        if KEPT:
+            dispatcher._cache = _KeptIfPossible(function)  # type: ignore[no-untyped-call]
+        return dispatcher
+
+    return compiled

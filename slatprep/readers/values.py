@@ -47,6 +47,9 @@ FOR_ALL = "Such keys hold for all objects: where this one alone is so, mend its 
 _SAMPLE = 1024
 """Least size of a sample of many voxels: enough for medians, which take a tenth of a ms."""
 
+_GOLDEN = (5**0.5 - 1) / 2
+"""The golden ratio, whose multiples lie evenly in 0..1 and fit no period."""
+
 _SHARE = 0.5
 """Share of implausible voxels at which an asset is implausible."""
 
@@ -119,8 +122,7 @@ def require_prediction(
     """
     if plausibility == "off" or len(values) == 0:
         return []
-    step = max(1, len(values) // _SAMPLE)
-    sample = values[::step].astype(np.float64)
+    sample = values[_sampled(len(values))].astype(np.float64)
     medians = np.median(np.abs(sample), axis=0)
     if not (medians > _PREDICTED).any():
         return []
@@ -160,6 +162,16 @@ def require_possible(where: str | Place, values: NDArray[Any], material: NDArray
     raise InputError(where, f"{guess}{_named(part)} has {fault}", "values in SI units")
 
 
+def _sampled(count: int) -> NDArray[np.intp]:
+    """Return rows that stand for so many: all of few, else `_SAMPLE` that lie evenly.
+
+    Voxels are in the order of the grid, so that a whole step could take all from one layer.
+    """
+    if count < 2 * _SAMPLE:
+        return np.arange(count)
+    return (np.arange(_SAMPLE) * _GOLDEN % 1.0 * count).astype(np.intp)
+
+
 def _parts(
     values: NDArray[np.float32],
     material: NDArray[Any] | None,
@@ -167,15 +179,15 @@ def _parts(
     classes: Sequence[str],
 ) -> list[Part]:
     """Return the medians of each class in a sample of voxels, without classes below `_FEW`."""
-    step = max(1, len(values) // _SAMPLE)
-    sample = values[::step].astype(np.float64)
+    chosen = _sampled(len(values))
+    sample = values[chosen].astype(np.float64)
     columns = {one.name: (k, one.unit) for k, one in enumerate(table)}
     own = np.full((len(sample), len(PROPERTIES)), np.nan)
     for k, known in enumerate(PROPERTIES):
         column, unit = columns.get(known.name, (-1, ""))
         if column >= 0 and unit in ("1", *FACTORS):
             own[:, k] = to_si(sample[:, column], unit)
-    ids = np.full(len(own), -1) if material is None else material[::step].astype(int)
+    ids = np.full(len(own), -1) if material is None else material[chosen].astype(int)
     if np.unique(ids, return_counts=True)[1].max() < _FEW * len(ids):
         ids[:] = -1  # No class counts alone among so many: compare the object as a whole.
     parts = []

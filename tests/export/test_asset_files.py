@@ -98,6 +98,14 @@ def test_another_model_takes_the_place_of_the_first(store, tmp_path):
     assert json.loads((root / "index.json").read_text())["files"] == ["metadata.csv"]
 
 
+def test_latents_of_another_encoder_have_its_name(copy, tmp_path):
+    latents = open_store(copy).attributes["latents"] | {"encoder": "other"}
+    edit_attributes(copy, latents=latents)
+    export_store(copy, tmp_path / "root", "npz", assets=["cup"])
+    assert [path.name for path in (tmp_path / "root/latents").iterdir()] == ["other"]
+    assert "latent_other" in (tmp_path / "root/metadata.csv").read_text()
+
+
 @pytest.mark.parametrize("name", ["", "..", "a/b", "../up", "a b", "-x"])
 def test_a_model_that_names_no_folder_is_refused(name, store, tmp_path):
     with pytest.raises(ConfigError, match=r"latent_model is .* expected an encoder's name"):

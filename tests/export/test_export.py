@@ -26,6 +26,7 @@ from slatprep.export import FORMATS, ExportOptions, export_store
 from slatprep.export.target import directory
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
+from slatprep.readers.hdf5 import find_groups
 from slatprep.readers.splits import Shares, split_objects
 from slatprep.storage.files import file_name
 from slatprep.store import Store, open_store
@@ -67,6 +68,14 @@ def test_an_export_is_itself_a_source_of_latents(format, name, store, mixed, tmp
     pairs = {pair.asset_id: pair for pair in found if not pair.problem}
     assert sorted(pairs) == ["ant", "cup"]
     np.testing.assert_array_equal(read_latents(pairs["cup"]).feats, mixed.assets["cup"].feats)
+
+
+def test_groups_of_hdf5_have_the_ids_that_readers_expect(copy, tmp_path):
+    names = ["-1", "_x", "__a.b", "x" * 255, "a.-"]
+    rewrite(copy, "asset/id", slice(None), np.array(names, dtype=object))
+    export_store(copy, tmp_path / "slat.h5", "hdf5")
+    groups = find_groups(tmp_path / "slat.h5", tmp_path, "{id}", {})
+    assert sorted(fields["id"] for fields, _ in groups) == sorted(names)
 
 
 def samples_of(folder: Path) -> list[dict[str, Any]]:

@@ -1,12 +1,15 @@
 """Kernels are compiled once, before any worker starts, and the user is told."""
 
+import errno
 import os
 import subprocess
 import sys
 
 import numpy as np
+from numba.core.caching import IndexDataCacheFile
 from support.synthetic import Dataset
 
+from slatprep.geometry import kernel
 from slatprep.pipeline.dataset import build_store
 from slatprep.workers import local
 from slatprep.workers.local import at_most
@@ -66,6 +69,16 @@ def test_a_build_compiles_nothing_that_was_not_compiled_before_it(tmp_path):
     command = [sys.executable, "-c", SCRIPT, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_on_a_full_disk_kernels_are_compiled_in_memory(monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(IndexDataCacheFile, "save", full)
+    monkeypatch.setattr(kernel, "KEPT", True)
+    twice = kernel.kernel()(lambda value: 2 * value)
+    assert twice(21) == 42
 
 
 # Root may write anywhere, so Numba is left the one folder that cannot be made.

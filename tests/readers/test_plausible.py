@@ -188,6 +188,15 @@ def test_of_many_classes_the_object_is_looked_at_as_a_whole():
         require_prediction("x", np.full((1000, 3), 1e6), material)
 
 
+def test_one_layer_of_a_column_in_si_units_stands_for_no_other(read):
+    grid = np.zeros((64, 64, 64, 4), np.float32)
+    grid[..., 3] = 7
+    grid[16:48, 16:48] = 930, 2e-3, 0.49, JELLY
+    grid[16:48, 16:48, 0, 1] = 2e6
+    with pytest.raises(InputError, match="look like GPa"):
+        read(grid=grid)
+
+
 def test_a_raw_grid_saved_channels_first_is_no_prediction(read):
     grid = np.ascontiguousarray(np.moveaxis(grid_of((JELLY, 1.85e6, 998, 0.45)), -1, 0))
     with pytest.raises(InputError, match="look like a raw grid in SI units, channels first"):
