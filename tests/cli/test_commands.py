@@ -92,6 +92,16 @@ def test_a_command_imports_no_more_than_it_needs(demo):
     assert "'numpy'" in info
 
 
+def test_a_backend_that_matplotlib_does_not_know_hinders_no_picture():
+    script = (
+        "import sys\nfrom slatprep.cli import main\nsys.argv = ['slatprep', '--version']\n"
+        "try: main()\nexcept SystemExit: import matplotlib\nprint(matplotlib.get_backend())"
+    )
+    command, strange = [sys.executable, "-c", script], os.environ | {"MPLBACKEND": "none-such"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=strange)
+    assert done.stdout.split()[-1].lower() == "agg"
+
+
 def test_entry_holds_libraries_to_one_thread():
     script = (
         "import sys, os\n"
