@@ -73,13 +73,15 @@ def check_alignment(
     path = options.chosen_store(store or named)
     from slatprep.inspect import check
     from slatprep.pipeline.decoys import measured_errors
+    from slatprep.pipeline.rows import SourceStore
     from slatprep.workers.local import run_in_order
 
     opened = options.opened(path)
     options.note_numbered(output, opened, asset_ids)
     chosen = check.choose_assets(opened, asset_ids, worst or 0, ambiguous)
     target = _target(path, picture, len(chosen))
-    tasks = ((opened.path, asset_id) for asset_id in chosen)
+    source = SourceStore(opened)
+    tasks = ((source, asset_id) for asset_id in chosen)
     checks = list(run_in_order(check.check_alignment, tasks, jobs))
     pictures: list[Path] = []
     sheet = None

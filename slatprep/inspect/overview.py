@@ -14,6 +14,7 @@ from slatprep.judge import THRESHOLDS
 from slatprep.records import Normalization, Place, Verdict
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
+from slatprep.store.reader import open_again
 from slatprep.store.records import StoredRecords
 
 UNKNOWN = "(unknown)"
@@ -80,6 +81,7 @@ def overview_of(store: Store) -> StoreOverview:
     for row, category in enumerate(columns["category"]):
         rows.setdefault(str(category), []).append(row)
     sizes = storage_of(store.path).files()
+    open_again(store.path, store.identity)  # Else these may be files of another store.
     return StoreOverview(
         store=store.path,
         format_version=store.format_version,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from slatprep.errors import require_one_of
 from slatprep.inspect.overview import UNKNOWN
 from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
+from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Place, Verdict
 from slatprep.store import Store, open_store
 from slatprep.workers import Progress
@@ -212,7 +213,8 @@ def store_statistics(
         for own in (list(some) for _, some in groupby(rows, column.__getitem__))
         for start in range(0, len(own), _TASK_ASSETS)
     ]
-    tasks = ((store.path, some, weight == "asset") for some in portions)
+    source = SourceStore(store)
+    tasks = ((source, some, weight == "asset") for some in portions)
     tallied = zip(portions, run_in_order(_tally_some, tasks, jobs), strict=True)
     ranges, labels = store.normalization.ranges, store.contents.labels
     total = nothing = no_tally(store, BINS)
@@ -244,9 +246,9 @@ def store_statistics(
     )
 
 
-def _tally_some(path: Place, rows: Sequence[int], by_asset: bool) -> Tally:
+def _tally_some(store: SourceStore, rows: Sequence[int], by_asset: bool) -> Tally:
     """Tally some assets of a store, in a worker."""
-    store, names = open_store(path), ("material", "properties")
+    names = "material", "properties"
     total = no_tally(store, BINS)
     for row in rows:
         # `store.asset` would read all columns of asset/*, which takes long in a large store.

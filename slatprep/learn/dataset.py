@@ -170,12 +170,16 @@ class SlatDataset(Dataset[Item]):
                 "change the shares, or add objects (at least as many as splits)"
             )
         self.asset_ids = [self.store.ids[index] for index in self.indices]
-        self.seed, self.min_confidence = seed, min_confidence
+        self.seed, self.min_confidence, self.epoch = seed, min_confidence, 0
         self._symmetries = lattice_symmetries(augmentation)
         self._latents = self.store.contents.latents
 
     def __len__(self) -> int:
         return len(self.indices)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch that decides the augmentation; a `SlatLoader` has an epoch of its own."""
+        self.epoch = epoch
 
     def __repr__(self) -> str:
         return (
@@ -184,7 +188,7 @@ class SlatDataset(Dataset[Item]):
         )
 
     def __getitem__(self, key: int | Draw) -> Item:
-        draw = key if isinstance(key, Draw) else Draw(key, 0)
+        draw = key if isinstance(key, Draw) else Draw(key, self.epoch)
         if not -len(self) <= draw.number < len(self):
             raise IndexError(f"asset {draw.number} of {len(self)}")
         rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)

@@ -26,7 +26,7 @@ from slatprep.records import Engine, Number, Place, Share, Verdict
 from slatprep.storage.atomic import writing
 from slatprep.storage.documents import read_as, read_bounded
 from slatprep.storage.place import storage_of
-from slatprep.store import Store, open_store
+from slatprep.store import Store
 from slatprep.store.reader import require_beside
 from slatprep.store.record import StageParameters
 from slatprep.store.records import ERRORS, StoredRecords, manifests_of
@@ -233,8 +233,9 @@ def measure_errors(
     found = [known.get((one.grid, one.slat, one.keys), one) for one in wanted]
     missing = [number for number, one in enumerate(found) if not one.evidence][:most_new]
     records, row_of = StoredRecords(store), {name: row for row, name in enumerate(store.ids)}
+    source = SourceStore(store)
     tasks = (
-        (store.path, k, wanted[k], records.read(row_of[wanted[k].grid]).parameters) for k in missing
+        (source, k, wanted[k], records.read(row_of[wanted[k].grid]).parameters) for k in missing
     )
     for done, (number, decoy) in enumerate(run_unordered(align_decoy, tasks, jobs, fail_decoy), 1):
         found[number] = decoy
@@ -361,13 +362,12 @@ def _hash(seed: int, text: str) -> bytes:
 
 
 def align_decoy(
-    path: Place, number: int, decoy: Decoy, parameters: StageParameters
+    store: SourceStore, number: int, decoy: Decoy, parameters: StageParameters
 ) -> tuple[int, Decoy]:
     """Align and judge a decoy with the parameters of its grid; return it with its number."""
     from slatprep.align import align
     from slatprep.pipeline.annotate import look_up
 
-    store = open_store(path)
     field, latents = store.asset(decoy.grid).field, store.asset(decoy.slat).latents
     alignment = align(field, latents, parameters.align)
     _, judgement = look_up(field, latents, alignment, parameters.sample)
@@ -375,11 +375,11 @@ def align_decoy(
 
 
 def fail_decoy(
-    path: Place, number: int, decoy: Decoy, parameters: StageParameters
+    store: SourceStore, number: int, decoy: Decoy, parameters: StageParameters
 ) -> tuple[int, Decoy]:
     """Raise for a decoy that killed its worker twice, the second time when it ran alone."""
     raise SlatprepError(
-        f"{path}: the decoy of {decoy.grid} with the SLAT of {decoy.slat} killed its worker "
+        f"{store.path}: the decoy of {decoy.grid} with the SLAT of {decoy.slat} killed its worker "
         "process twice, probably because memory ran out"
     )
 

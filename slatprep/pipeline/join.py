@@ -32,6 +32,7 @@ from slatprep.storage.documents import read_as
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
 from slatprep.store import Store, open_store
+from slatprep.store.reader import open_again
 from slatprep.store.records import build_in, found_manifests
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, at_most
@@ -159,7 +160,8 @@ def concat_stores(
 
 def _source(store: Store | str | Place) -> SourceStore:
     # Opened anew, as workers do: an open store may hold data of a store that was replaced since.
-    return SourceStore(open_store(open_store(store).path))
+    opened = open_store(store)
+    return SourceStore(open_again(opened.path, opened.identity))
 
 
 def _rows(sources: Sequence[SourceStore]) -> list[Row]:

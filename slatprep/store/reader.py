@@ -169,8 +169,8 @@ class StoredAsset:
 class Store(AssetTable):
     """A store opened for reading; `open_store` makes one.
 
-    Threads and forked processes may share it; a pickled store opens the same path
-    again.
+    Threads and forked processes may share it. A pickled store opens the same path
+    again; if another store is there by then, each use raises StoreError.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ class Store(AssetTable):
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (open_store, (self.path,))
+        return _opened_elsewhere, (self.path, self.identity)
 
     def __iter__(self) -> Iterator[StoredAsset]:
         return (self.asset(index) for index in range(len(self)))
@@ -339,6 +339,42 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
     for finding in width_findings(store.about, store.metadata):
         raise AttributesError(f"{path}/{finding}; run `slatprep verify`")
     return store
+
+
+def open_again(path: Place, identity: str) -> Store:
+    """Open a store that was opened before, by its path and `AssetTable.identity`.
+
+    StoreError if it cannot be opened, or another store is there now.
+    """
+    store = open_store(path)
+    if store.identity != identity:
+        raise StoreError(
+            f"{path}: is another store than the one that was opened (was the store replaced?); "
+            "open it again"
+        )
+    return store
+
+
+class LostStore(Store):
+    """Stands for a store that a process got but cannot open; each use raises the `error`.
+
+    An error while a task is unpickled would end the worker, and its words would be lost.
+    """
+
+    def __init__(self, error: StoreError) -> None:
+        self.__dict__["error"] = error
+
+    def __getattribute__(self, name: str) -> Any:
+        if name.startswith("__"):
+            return super().__getattribute__(name)
+        raise self.__dict__["error"]
+
+
+def _opened_elsewhere(path: Place, identity: str) -> Store:
+    try:
+        return open_again(path, identity)
+    except StoreError as error:
+        return LostStore(error)
 
 
 def is_store(path: Place) -> bool:

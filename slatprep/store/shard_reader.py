@@ -13,7 +13,7 @@ import sys
 import threading
 import weakref
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
@@ -82,7 +82,8 @@ class RowReader:
     """Reads rows of one array of a store; safe to share between threads and across a fork.
 
     A file has `shard_rows` rows. It has an index if it is `sharded`; otherwise it is one chunk. A
-    chunk that was never written holds the `fill_value`.
+    chunk that was never written holds the `fill_value`, and so does a file that is not among the
+    `listed` names. Without such a list, every file must exist.
     """
 
     folder: Folder
@@ -92,6 +93,7 @@ class RowReader:
     sharded: bool
     decoder: ChunkDecoder
     fill_value: Any
+    listed: Container[str] | None = field(default=None, init=False)
     _shards: dict[int, _Shard] = field(default_factory=dict, init=False)
     _local: threading.local = field(default_factory=threading.local, init=False)
 
@@ -99,8 +101,6 @@ class RowReader:
         self.dtype = self.decoder.dtype
         self.chunk_rows = self.decoder.shape[0]
         self.chunks_per_shard = self.shard_rows // self.chunk_rows
-        # Zarr writes no file for fill values alone, such as a column of empty strings.
-        self.optional = self.name.startswith("asset/") and self.name != "asset/offset"
 
     @classmethod
     def of(cls, folder: Folder, name: str, metadata: Mapping[str, Any]) -> RowReader:
@@ -234,7 +234,7 @@ class RowReader:
             file = self.folder.open(self.key(number))
             shard = _Shard(file, self._index(number, file, file.size()))
         except FileNotFoundError:
-            if self.optional:
+            if self.listed is not None and self.key(number) not in self.listed:
                 return _Shard(None, np.full((self.chunks_per_shard, 2), MISSING, np.uint64))
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:

@@ -26,6 +26,7 @@ from slatprep.learn.runs import EpochRecord
 from slatprep.pipeline.dataset import build_store
 from slatprep.storage import atomic
 from slatprep.storage.place import place_of
+from slatprep.store.integrity import digests_in
 
 NOWHERE = Path("/proc/nobody-may-write-here")
 
@@ -112,6 +113,15 @@ def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tm
     assert said in told["error"] and said in " ".join(result.stderr.split())
     assert (told["command"], told["ok"]) == (command, False)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lost_file_of_a_column_is_named_and_one_never_written_is_fine(copy):
+    written = {"asset/category/c/0", "asset/verdict/c/0"} & digests_in(open_store(copy)).keys()
+    assert written == {"asset/verdict/c/0"}  # All categories are empty.
+    (copy / "asset/verdict/c/0").unlink()
+    for words in (("info",), ("list",), ("stats",), ("diff", copy)):
+        told = refused(words[0], copy, *words[1:], code=1)
+        assert f"{copy}/asset/verdict/c/0: is missing (was the store replaced?)" in told
 
 
 def test_a_misspelt_command_is_told_with_the_one_meant():

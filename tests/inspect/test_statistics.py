@@ -16,9 +16,13 @@ from support.made_store import rewrite
 from slatprep import ConfigError, StoreError, open_store
 from slatprep.cli.output import as_json
 from slatprep.inspect import statistics
+from slatprep.inspect.check import check_alignment
+from slatprep.inspect.overview import overview_of
 from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.pipeline.dataset import BuildSummary
+from slatprep.pipeline.rows import SourceStore
 from slatprep.records import MATERIAL_CLASSES
+from slatprep.workers.local import run_in_order
 
 CATEGORIES = ["b", "", "a", "=b", "b"]
 VERDICTS = ["good", "good", "failed", "doubtful", "good"]
@@ -224,6 +228,25 @@ def test_nothing_chosen_is_nothing_counted(store, tmp_path):
     printed = document(*words)
     assert printed["total"]["slat"]["properties"]["density"]["si"]["mean"] is None
     assert printed["categories"] == []
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_two_stores_are_not_mixed(store, tmp_path, jobs):
+    """An update replaced the store after its columns were read; rows are in another order."""
+    path = Path(shutil.copytree(store, tmp_path / "s.zarr"))
+    opened = open_store(path)
+    assert len(overview_of(opened).categories) == 4
+    path.rename(tmp_path / "old.zarr")
+    shutil.copytree(store, path)
+    rewrite(path, "asset/id", slice(2), opened.ids[1::-1])
+    shutil.rmtree(tmp_path / "old.zarr")
+    for read in (
+        lambda: statistics.store_statistics(opened, jobs=jobs),
+        lambda: overview_of(opened),
+        lambda: list(run_in_order(check_alignment, [(SourceStore(opened), "ant")] * 2, jobs)),
+    ):
+        with pytest.raises(StoreError, match="was the store replaced"):
+            read()
 
 
 def test_wrong_use_is_refused(store):

@@ -14,9 +14,11 @@ import torch
 import zarr
 from hypothesis import given
 from hypothesis import strategies as st
+from support.made_store import rewrite
 from torch import Tensor
+from torch.utils.data import DataLoader
 
-from slatprep import ConfigError, learn, open_store
+from slatprep import ConfigError, StoreError, learn, open_store
 from slatprep.learn import decoder
 from slatprep.learn.augment import lattice_symmetries
 from slatprep.learn.splits import select_assets
@@ -134,6 +136,29 @@ def test_workers_change_nothing(learn_store, workers, method, first):
     one, other = ([i for b in half for i in b.asset_ids] for half in (alone[:5], alone[5:]))
     assert sorted(one) == sorted(other) == dataset.asset_ids
     assert one != other
+
+
+def test_no_worker_reads_another_store_at_the_same_path(learn_store, tmp_path):
+    """The same assets, whose rows an update has in another order."""
+    path = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
+    loader = learn.SlatLoader(learn.SlatDataset(path), 2, workers=1, start_method="spawn")
+    ids = loader.dataset.asset_ids
+    rewrite(path, "asset/id", slice(2), ids[1::-1])
+    with pytest.raises(StoreError, match="was the store replaced"):
+        list(loader)
+
+
+def test_a_plain_loader_augments_each_epoch_anew(learn_store):
+    ours = learn.SlatDataset(learn_store, augmentation="all", seed=3)
+    loader = learn.SlatLoader(ours, 3)
+    dataset = learn.SlatDataset(learn_store, augmentation="all", seed=3)
+    plain = DataLoader(dataset, 3, collate_fn=learn.collate, num_workers=2)
+    found = []
+    for epoch, known in enumerate((epochs(loader, 0), epochs(loader, 1))):
+        dataset.set_epoch(epoch)
+        found.append([batch.coords for batch in plain])
+        assert all(map(torch.equal, found[-1], [batch.coords for batch in known]))
+    assert not all(map(torch.equal, *found))
 
 
 def test_symmetries_are_the_groups_they_should_be():

@@ -39,14 +39,16 @@ def test_a_subset_is_the_build_of_its_assets(folder, tmp_path):
     assert records_of(tmp_path / "s.manifests" / "assets.jsonl") == built
 
 
-def test_a_store_that_was_replaced_since_it_was_opened_is_read_anew(folder, tmp_path):
+def test_a_store_that_was_replaced_since_it_was_opened_is_refused(folder, tmp_path):
+    """A number would mean another asset of the new store."""
     path = copied(folder / "abcd.zarr", tmp_path / "w.zarr")
     opened = open_store(path)
     assert opened.ids[0] == "a" and opened.columns_of(["density"])
     shutil.rmtree(path)
     shutil.copytree(folder / "bd.zarr", path)
-    subset_store(opened, tmp_path / "s.zarr", ["d", "b.s", "b.front"])
-    assert tree(tmp_path / "s.zarr") == tree(folder / "bd.zarr")
+    for make in (subset_store, lambda *given: concat_stores(given[0:1] * 2, given[1])):
+        with pytest.raises(StoreError, match=r"was the store replaced\?\); open it again"):
+            make(opened, tmp_path / "s.zarr", [0])
 
 
 @pytest.mark.parametrize("ranges", ["dataset", "p1-p99", "dataset of train"])

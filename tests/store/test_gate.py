@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,14 @@ import pytest
 import zarr
 from google_crc32c import value as crc32c
 from support.commands import refused, run
-from support.made_store import edit_json, placed
+from support.made_store import edit_attributes, edit_json, placed, rewrite
 from support.memory import less_than
 
 from slatprep import Store, StoreError, build_store, open_store
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, StoreParameters
+from slatprep.pipeline.rows import SourceStore
+from slatprep.store.assets import ASSET_COLUMNS
 from slatprep.store.contract import gate_findings
 from slatprep.store.layout import ARRAYS
 
@@ -219,8 +222,33 @@ def test_a_replaced_store_is_not_mixed_with_the_new_one(copy):
     copy.rename(copy.with_name("gone"))
     shutil.copytree(copy.with_name("gone"), copy)
     shutil.rmtree(copy.with_name("gone"))
-    with pytest.raises(StoreError, match="was the store replaced"):
-        old.read(0)
+    reads: list[Callable[[], object]] = [lambda: old.read(0), old.to_pandas]
+    reads += [partial(old.column, name) for name in ("id", "transform", *ASSET_COLUMNS)]
+    for read in reads:
+        with pytest.raises(StoreError, match="was the store replaced"):
+            read()
+
+
+def test_a_store_that_was_sent_to_a_process_is_that_store_or_none(copy):
+    """Of another build or another order of the same rows, or gone; each use says so."""
+    opened = open_store(copy)
+    # A process opens a `SourceStore` once.
+    sent = [pickle.dumps(one) for _ in range(3) for one in (opened, SourceStore(opened))]
+    for one in map(pickle.loads, sent[:2]):
+        assert one.ids == opened.ids and digest(one.read(0)) == digest(opened.read(0))
+    edit_attributes(copy, manifest="0" * 64)
+    lost = [pickle.loads(one) for one in sent[2:4]]
+    edit_attributes(copy, manifest=opened.about.manifest)
+    rewrite(copy, "asset/id", slice(2), opened.ids[1::-1])
+    lost += [pickle.loads(one) for one in sent[4:]]
+    for one in lost:
+        for use in (len, iter, lambda one: one.read(0), lambda one: one["ant"], pickle.dumps):
+            with pytest.raises(StoreError, match=r"was the store replaced\?\); open it again"):
+                use(one)
+    shutil.rmtree(copy)
+    gone = pickle.loads(sent[0])
+    with pytest.raises(StoreError, match="is not a slatprep store"):
+        gone.read(0)
 
 
 def test_opening_reads_one_file_needs_no_other_library_and_closes_quietly(store):

@@ -106,20 +106,22 @@ def test_a_chunk_that_was_never_written_holds_the_fill_value(tmp_path):
 
 @pytest.mark.parametrize("shard", [None, 6])
 def test_a_column_of_fill_values_alone_needs_no_file(tmp_path, shard):
-    """As zarr leaves out what nobody wrote, of assets alone; where rows begin is always written."""
-    for name in ("asset/category", "asset/offset", "voxel/valid"):
-        fill = "" if name == "asset/category" else 0
-        values = np.array([""] * 9, object) if fill == "" else np.zeros(9, np.int64)
-        make(tmp_path, name, values, 3, shard, fill)
-        assert not (tmp_path / name / "c").exists()
-    assert reader_of(tmp_path, "asset/category").read(1, 9).tolist() == [""] * 8
-    for name in ("asset/offset", "voxel/valid"):
-        with pytest.raises(StoreError, match=f"{name}/c/0: is missing"):
-            reader_of(tmp_path, name).read(0, 2)
+    """As zarr leaves out what nobody wrote, if the names of the files that were written say so."""
+    make(tmp_path, "asset/category", np.array([""] * 9, object), 3, shard, "")
+    assert not (tmp_path / "asset/category/c").exists()
+    reader = reader_of(folder := WatchedFolder(tmp_path), "asset/category")
+    with pytest.raises(
+        StoreError, match=r"asset/category/c/0: is missing \(was the store replaced"
+    ):
+        reader.read(0, 2)
+    reader.listed = {"asset/category/c/1"}
+    assert reader.read(1, 3).tolist() == [""] * 2
+    with pytest.raises(StoreError, match="asset/category/c/1: is missing"):
+        reader.read(0, 9)
+    reader.listed = ()
+    assert reader.read(1, 9).tolist() == [""] * 8
     with pytest.raises(StoreError, match="do not follow one another"):
-        list(reader_of(tmp_path, "asset/category").packed(0, 1))
-    folder = WatchedFolder(tmp_path)
-    assert reader_of(folder, "asset/category").read(0, 9).tolist() == [""] * 9
+        list(reader.packed(0, 1))
     assert folder.asked == []
 
 

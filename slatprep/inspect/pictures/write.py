@@ -15,10 +15,10 @@ from slatprep.inspect.check import FITNESS, AlignmentCheck, check_alignment
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import draw_alignment, error_picture, outlined
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, scene_of, views
-from slatprep.records import Place
+from slatprep.pipeline.rows import SourceStore
 from slatprep.storage.atomic import staged, writing
 from slatprep.storage.files import file_name
-from slatprep.store.reader import Store, StoredAsset, open_store
+from slatprep.store.reader import Store, StoredAsset
 from slatprep.store.records import StoredRecords
 from slatprep.workers import Progress
 from slatprep.workers.local import run_unordered
@@ -60,7 +60,8 @@ def write_pictures(
         kind = "png"
         files = {one.asset_id: target / f"{file_name(one.asset_id)}.png" for one in checks}
     on_sheet = {one.asset_id for one in checks[:MOST]} if len(checks) > 1 else ()
-    tasks = ((store.path, one, kind, one.asset_id in on_sheet) for one in checks)
+    source = SourceStore(store)
+    tasks = ((source, one, kind, one.asset_id in on_sheet) for one in checks)
     cells: dict[str, _Cell | None] = {}
     for done, (asset_id, picture, cell) in enumerate(run_unordered(_drawn, tasks, jobs), 1):
         _write(files[asset_id], picture)
@@ -86,7 +87,7 @@ def picture_of(asset: StoredAsset) -> Image:
     import PIL.Image
 
     check = check_alignment(asset.store, asset.index)
-    return PIL.Image.open(io.BytesIO(_drawn(asset.store.path, check, "png", False)[1]))
+    return PIL.Image.open(io.BytesIO(_drawn(asset.store, check, "png", False)[1]))
 
 
 class _Cell(NamedTuple):
@@ -98,10 +99,9 @@ class _Cell(NamedTuple):
 
 
 def _drawn(
-    path: Place, check: AlignmentCheck, kind: str, on_sheet: bool
+    store: Store, check: AlignmentCheck, kind: str, on_sheet: bool
 ) -> tuple[str, bytes, _Cell | None]:
     """Return an asset's id, its picture, and its cell of the sheet if `on_sheet`."""
-    store = open_store(path)
     asset = store.asset(check.asset_id)
     scene, title = scene_of(asset), title_of(asset)
     alignment = StoredRecords(store).read(asset.index).alignment
