@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parameters import BuildParameters
 from slatprep.parameters.files import checked
 from slatprep.pipeline.before import SHARE, Before, look_back
@@ -36,7 +36,7 @@ from slatprep.pipeline.publish import (
     Destination,
     counts_of,
     publish_build,
-    require_records_file,
+    require_free,
     summarise,
 )
 from slatprep.pipeline.recipe import Wanted, recipe_of
@@ -48,8 +48,10 @@ from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Normalization, Place
 from slatprep.storage.atomic import staged, writing
+from slatprep.store.reader import require_outside
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
+from slatprep.store.records import ASSETS
 from slatprep.workers import Progress
 from slatprep.workers.local import Jobs, require_shared, run_unordered, start_early
 
@@ -274,8 +276,9 @@ def align_pairs(
     """
     begin = time.perf_counter()
     parameters = checked(BuildParameters, parameters)
-    require_records_file(Path(out))
     out, crew = Path(out), Crew(jobs, assets_per_job, progress, note)
+    require_outside(out)
+    require_free(out, mark=ASSETS, kind=ConfigError)
     with work_beside(out.absolute(), arrays=False) as work:
         context = BuildContext(parameters, recipe_of(parameters), work.spool, None, strict)
         pairs = _discover(parameters, jobs, work.scratch, note=note)

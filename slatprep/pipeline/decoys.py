@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from slatprep.errors import SlatprepError, StoreError, amount
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.plan import Crew
-from slatprep.pipeline.publish import is_marked
+from slatprep.pipeline.publish import require_free
 from slatprep.pipeline.rows import SourceStore, slat_contents
 from slatprep.records import Engine, Number, Place, Share, Verdict
 from slatprep.storage.atomic import writing
@@ -425,8 +424,7 @@ def writable_file(store: Place) -> Place:
     local = storage_of(file).local
     if local is not None:
         require_beside(local.parent)
-        if os.path.lexists(local) and not is_marked(local, ERRORS):
-            raise StoreError(f"{local}: is not slatprep's; expected none: move it away")
+        require_free(local, mark=ERRORS)
     return file
 
 

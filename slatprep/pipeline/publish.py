@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError, in_unicode
+from slatprep.errors import ConfigError, SlatprepError, StoreError, in_unicode
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.notices import moved_ranges
 from slatprep.pipeline.plan import why_taken_out
@@ -147,22 +147,19 @@ class Destination:
 
 
 def _replaceable(out: Path) -> Path:
+    require_outside(out, to_replace=True)
     try:
         taken = out.exists() and not is_store(out) and not (out.is_dir() and not any(out.iterdir()))
-        target = out.resolve()
     except OSError as error:
         raise StoreError(
             f"{out}: cannot be looked at ({error.strerror}); expected a path that may be read and "
             "written"
         ) from error
-    around = next((str(path) for path in target.parents if is_store(path)), "")
-    if around:
-        raise ConfigError(f"{out} lies inside the store {around}; choose a path outside of it")
     if taken:
         raise ConfigError(
             f"{out} exists and is not a slatprep store; expected a store to replace, or a new path"
         )
-    return target
+    return out.resolve()
 
 
 def _require_records(folder: Path, store: Path | None) -> None:
@@ -170,23 +167,19 @@ def _require_records(folder: Path, store: Path | None) -> None:
     if store is not None and folder.resolve().is_relative_to(store):
         raise StoreError(f"{folder}: lies in the store; expected a folder outside of it")
     require_outside(folder)
-    there = [folder / BUILD] if os.path.lexists(folder / BUILD) else []
-    there += stale_files(folder, ()) if folder.is_dir() else []
-    # If one file is damaged, another identifies the folder.
-    if there and not any(is_marked(file) for file in there):
-        raise StoreError(
-            f"{folder}: holds a {there[0].name} that is not slatprep's; expected the records of a "
-            "build: move it away, or name another folder with --manifests"
-        )
+    require_free(folder / BUILD, *(stale_files(folder, ()) if folder.is_dir() else ()))
 
 
-def require_records_file(file: Path) -> None:
-    """Raise ConfigError if a file to write lies in a store, or exists without records."""
-    require_outside(file)
-    if os.path.lexists(file) and not is_marked(file, ASSETS):
-        raise ConfigError(
-            f"{file} exists and holds no records of slatprep; expected such records to replace, "
-            "or a new path"
+def require_free(*files: Path, mark: str = "", kind: type[SlatprepError] = StoreError) -> None:
+    """Raise if any of these files exist and none of them is marked, see `is_marked`.
+
+    If one file is damaged, another identifies their folder.
+    """
+    there = [file for file in files if os.path.lexists(file)]
+    if there and not any(is_marked(file, mark) for file in there):
+        raise kind(
+            f"{there[0]} exists and is not slatprep's; expected such a file to replace, or none: "
+            "move it away, or choose another path"
         )
 
 

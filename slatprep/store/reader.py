@@ -386,14 +386,16 @@ def is_store(path: Place) -> bool:
     return bool(attributes.get("format") == FORMAT)
 
 
-def require_outside(out: Path) -> None:
+def require_outside(out: Path, to_replace: bool = False) -> None:
     """Raise unless an output path lies outside of every store.
 
-    ConfigError if it is a store, lies inside a store, or cannot be read.
+    ConfigError if it is a store, unless a store is `to_replace`; if it lies inside a store, or
+    cannot be read.
     """
     try:
         target = out.resolve()
-        around = next((path for path in (target, *target.parents) if is_store(path)), None)
+        places = target.parents if to_replace else (target, *target.parents)
+        around = next((path for path in places if is_store(path)), None)
     except (OSError, RuntimeError) as error:  # loops of links
         raise ConfigError(
             f"{out}: cannot be looked at ({error}); expected a path that may be written"
