@@ -11,9 +11,8 @@ done again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ from slatprep.records import (
     StructuredLatents,
 )
 from slatprep.storage.arrays import ArrayFile, write_arrays
-from slatprep.storage.atomic import staged_apart, writing
+from slatprep.storage.atomic import writing
 from slatprep.storage.faults import reached
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, is_spooled
@@ -163,21 +162,14 @@ class Spool:
             yield ArrayFile(file)
 
     def _write(self, key: str, asset_id: str, record: bytes, arrays: Arrays) -> None:
-        everything: Arrays = {**arrays, "record": np.frombuffer(record, np.uint8)}
+        path, everything = self._path(key), {**arrays, "record": np.frombuffer(record, np.uint8)}
         with (
             writing(asset_id, self.directory),
-            self._staged(self._path(key)) as partial,
+            storage_of(path).staged_apart(path.parent) as partial,
             partial.open("wb") as file,
         ):
             write_arrays(file, everything)
         reached("asset spooled", asset_id)
-
-    def _staged(self, place: Place) -> AbstractContextManager[Path]:
-        path = storage_of(place).local
-        if path is None:
-            return storage_of(place).staged()
-        path.parent.mkdir(exist_ok=True)
-        return staged_apart(path, path.parent)
 
 
 def _voxels_in(arrays: ArrayFile) -> Arrays:

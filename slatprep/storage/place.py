@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING, TypeGuard
 
 from slatprep.errors import InputError, StoreError
 from slatprep.storage.archives import Archive
-from slatprep.storage.atomic import staged
+from slatprep.storage.atomic import staged, staged_apart
 from slatprep.storage.cache import cached_file, copied_version, folder_for
 from slatprep.storage.files import (
     Listing,
@@ -232,6 +232,13 @@ class Storage:
         """Yield a local file that becomes the place's content, complete, unless an error occurs."""
         return staged(self._path)
 
+    def staged_apart(self, folder: Place) -> AbstractContextManager[Path]:
+        """As `staged`, for a worker: the file begins in `folder`, see `atomic.staged_apart`."""
+        begun = Path(str(folder))
+        begun.mkdir(exist_ok=True)  # Fails if the folder around it was removed.
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        return staged_apart(self._path, begun)
+
     def work_folder(self) -> Path:
         """Return the local folder for work on the place."""
         return self._path.with_name(f".{self._path.name}.work")
@@ -317,6 +324,9 @@ class _ObjectStore(Storage):
             file = Path(folder, self.place.name)
             yield file
             self.place.upload(file)
+
+    def staged_apart(self, folder: Place) -> AbstractContextManager[Path]:
+        return self.staged()
 
     def work_folder(self) -> Path:
         return folder_for(self.place) / "work"

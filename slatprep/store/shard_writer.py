@@ -8,16 +8,15 @@ For an object store it is written to the worker's own disk first, in the folder 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import Place
-from slatprep.storage.atomic import staged_apart, writing
+from slatprep.storage.atomic import writing
 from slatprep.storage.chunks import single_threaded_blosc
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import read_metadata
@@ -51,7 +50,12 @@ class ShardWriter:
         self._rows = self._chunks = self._bytes = 0
         self.file = layout.key(start // layout.shard_rows)
         self._stack = ExitStack()
-        partial = self._stack.enter_context(_staged(store, self.file))
+        target = storage_of(store / self.file)
+        if target.local is None:
+            self._stack.enter_context(writing(self.file, store))
+        # Beside the store, so that leftovers of a killed worker are no part of it.
+        partials = store.parent / f"{store.name}.partial"
+        partial = self._stack.enter_context(target.staged_apart(partials))
         self._file = self._stack.enter_context(partial.open("wb"))
         self._digest = hashlib.sha256()
         self._size = 0
@@ -121,22 +125,6 @@ class ShardWriter:
     def _flush(self, chunk: NDArray[Any]) -> None:
         data, self._rows = self._encode(chunk), 0
         self.append_packed(data, [len(data)])
-
-
-@contextmanager
-def _staged(store: Place, file: str) -> Iterator[Path]:
-    """Yield a local file that becomes a store's file in one step, unless an error is raised."""
-    folder = storage_of(store).local
-    if folder is None:
-        with writing(file, store), storage_of(store / file).staged() as partial:
-            yield partial
-        return
-    (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    # Beside the store, so that leftovers of a killed worker are no part of it.
-    partials = folder.with_name(f"{folder.name}.partial")
-    partials.mkdir(exist_ok=True)
-    with staged_apart(folder / file, partials) as partial:
-        yield partial
 
 
 def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]:
