@@ -14,6 +14,7 @@ import os
 import random
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -118,8 +119,7 @@ class Before:
         state = _store_state(self.place, self.place.manifests(store.path), len(store), wait=True)
         seen = {row.asset_id: row.seen for row in rows}
         states = [seen.get(asset_id, b"") for asset_id in store.ids]
-        folder, bound = _seen_folder(self.place), self._bound_to(store)
-        write_seen(folder, bound, state, states, store.column("key"))
+        write_seen(_seen_folder(self.place), self._bound_to(store), state, states)
 
     def _bound_to(self, store: Store) -> bytes:
         """Return a digest of this machine, the store and how sources are read, to bind states."""
@@ -174,10 +174,13 @@ def look_back(
     except StoreError as error:
         before.damaged = (str(error),) if is_store(place.store) else ()
         return before
-    keys, state = read_seen(_seen_folder(place), before._bound_to(previous))
+    seen, state = read_seen(_seen_folder(place), before._bound_to(previous))
     before.built, before.as_left = bool(state), before._is_as_left(previous, state)
-    states = look(pairs) if keys and rehash < 1 else {}
-    before.known = {name: (own, keys[own]) for name, own in states.items() if own in keys}
+    states = look(pairs) if seen and rehash < 1 else {}
+    with suppress(StoreError):  # A column is damaged, and `check` finds it.
+        keys = dict(zip(previous.ids, previous.column("key"), strict=True)) if states else {}
+        known = [name for name, own in states.items() if own in seen and name in keys]
+        before.known = {name: (states[name], keys[name].tobytes().hex()) for name in known}
     before._sample(rehash, seed, crew)
     return before
 

@@ -156,7 +156,6 @@ def build_store(
         if before.suffices and not keep_work:
             return _publish(before, begin)
         before.check(crew.of(len(pairs)))
-        place.there = before.previous
         context = BuildContext(parameters, wanted.recipe, work.spool, before.previous, strict)
         plan = plan_assets(pairs, context, crew, before.known)
         assets = _finish_all(pairs, plan, context, crew, None if keep_work else before)
@@ -245,13 +244,12 @@ def plan_build(
     pairs = _discover(parameters, jobs)
     before = look_back(place, pairs, wanted, crew, fresh, float(rehash))
     before.check(jobs)
-    place.there = before.previous
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
     plan = plan_assets(pairs, context, crew, before.known, ahead=True)
     absent = {one for one, planned in plan.items() if planned.action in _ABSENT}
-    gone = place.lost({pair.asset_id for pair in pairs} - absent)
+    gone, ranges = place.lost({pair.asset_id for pair in pairs} - absent, "is")
     given = wanted.ranges if isinstance(wanted.ranges, Normalization) else None
-    warnings = tuple(moved_ranges(given, place.ranges_there("is"))) if given else ()
+    warnings = tuple(moved_ranges(given, ranges)) if given else ()
     return BuildPlan(
         place.out, tuple(plan.values()), before.damaged, why_taken_out(gone, absent), warnings
     )

@@ -60,11 +60,10 @@ class Destination:
     """Destination of a store and its records.
 
     `out` is the store as its user names it, and `store` its real place, behind a link. `manifests`
-    is the folder of its records, if not beside it. `there` is the existing store, if it is open
-    already; `removed` are those of its assets that the new store lacks, and `ranges` its ranges, if
-    they are known, by words for it. ConfigError if there is
-    something other than a store, or it lies in another store. StoreError if the folder holds files
-    of other origin or the records of another store.
+    is the folder of its records, if not beside it. `removed` are those of an existing store's
+    assets that the new store lacks, and `ranges` its ranges, if they are known, by words for it.
+    ConfigError if there is something other than a store, or it lies in another store. StoreError if
+    the folder holds files of other origin or the records of another store.
     """
 
     def __init__(self, out: str | Place, manifests: str | Place | None = None) -> None:
@@ -85,7 +84,6 @@ class Destination:
                 _require_own(folder, path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
-        self.there: Store | None = None
         self.replacing = False
         self.removed: list[str] = []
         self.ranges: dict[str, Normalization] = {}
@@ -112,24 +110,23 @@ class Destination:
         `staged` are its files that are on the object store already.
         """
         self.replacing = True
-        self.removed, self.ranges = self.lost(ids), self.ranges_there("was")
+        self.removed, self.ranges = self.lost(ids, "was")
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)
         elif (path := storage_of(self.store).local) is not None:
             replace_directory(new, path)
         reached("store replaced", str(self.store))
 
-    def lost(self, ids: Iterable[str]) -> list[str]:
-        """Return the ids of the existing store that are not among `ids`, sorted."""
-        with suppress(StoreError):  # There is no store, or its ids cannot be read.
-            self.there = self.there or open_store(self.store)
-            return sorted(set(self.there.ids).difference(ids))
-        return []
+    def lost(self, ids: Iterable[str], verb: str) -> tuple[list[str], dict[str, Normalization]]:
+        """Return ids of the existing store not among `ids`, sorted; its ranges for `moved_ranges`.
 
-    def ranges_there(self, verb: str) -> dict[str, Normalization]:
-        """Return the ranges of the existing store that `lost` found, for `moved_ranges`."""
-        there = self.there  # Its length would be read, which may be damaged.
-        return {} if there is None else {f"the store that {verb} there": there.normalization}
+        `verb` says in words when it lies there.
+        """
+        with suppress(StoreError):  # There is no store, or its ids cannot be read.
+            there = open_store(self.store)
+            ranges = {f"the store that {verb} there": there.normalization}
+            return sorted(set(there.ids).difference(ids)), ranges
+        return [], {}
 
     def publish(self) -> None:
         """Make the new version on an object store the current one."""

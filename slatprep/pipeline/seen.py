@@ -1,7 +1,7 @@
-"""Keep the states of a build's sources, and the keys of its assets, for the next build.
+"""Keep the states of a build's sources for the next build.
 
 `slatprep.storage.states` says when a state of a source proves that its content is the same. The
-state is taken as the source is read, and kept with the key that the content gave. The file `NAME`
+state is taken as the source is read; the store has the key that the content gave. The file `NAME`
 lies beside the records of a build. It is valid for this machine, this store and the same code and
 parameters; otherwise the sources are hashed.
 """
@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from slatprep.errors import InputError, StoreError
 from slatprep.readers.slat import texture_of
@@ -35,29 +34,24 @@ _STATE = 16
 _UNKNOWN = bytes(_STATE)
 
 
-def read_seen(folder: Path, bound: bytes) -> tuple[dict[bytes, str], bytes]:
+def read_seen(folder: Path, bound: bytes) -> tuple[set[bytes], bytes]:
     """Read what the last build saw; nothing unless there is a whole file with the same `bound`.
 
-    Return the key of each of the store's assets by the state of its sources, and the state of the
-    store's files and records when it was finished; zeros if that state was not known.
+    Return the states of the sources of the store's assets, each of which has its asset's id, and
+    the state of the store's files and records when it was finished; zeros if that was not known.
     """
     try:
         with BufferedReader(open_regular(folder / NAME)) as file:
             seen = dict(ArrayFile(file))
         if seen["bound"].tobytes() != bound:
-            return {}, b""
-        pairs = zip(seen["states"], seen["keys"], strict=True)
-        keys = {state.tobytes(): key.tobytes().hex() for state, key in pairs}
-        keys.pop(_UNKNOWN, None)
-        return keys, seen["store"].tobytes()
+            return set(), b""
+        return {state.tobytes() for state in seen["states"]} - {_UNKNOWN}, seen["store"].tobytes()
     except (OSError, StoreError, LookupError, ValueError):
-        return {}, b""
+        return set(), b""
 
 
-def write_seen(
-    folder: Path, bound: bytes, store: bytes, states: Iterable[bytes], keys: NDArray[np.uint8]
-) -> None:
-    """Write the state of the sources of each asset of a store, empty if unknown, and its key.
+def write_seen(folder: Path, bound: bytes, store: bytes, states: Iterable[bytes]) -> None:
+    """Write the state of the sources of each asset of a store, empty if unknown.
 
     The file is written in place. Checksums reveal a partial file, which costs the
     next build some hashing. So does a file that cannot be written.
@@ -65,7 +59,7 @@ def write_seen(
     held = b"".join(own or _UNKNOWN for own in states)
     texts = {"bound": bound, "store": store or bytes(32), "states": held}
     arrays = {name: np.frombuffer(text, np.uint8) for name, text in texts.items()}
-    arrays |= {"states": arrays["states"].reshape(-1, _STATE), "keys": keys}
+    arrays["states"] = arrays["states"].reshape(-1, _STATE)
     with suppress(OSError), private_file(folder / NAME) as file:
         write_arrays(file, arrays)
 
