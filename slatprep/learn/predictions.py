@@ -1,8 +1,8 @@
 """Read predictions by asset: npz files, Zarr or HDF5.
 
 The files are not trusted. Nothing is unpickled. Links that lead out of them and arrays of another
-type or shape than a prediction's are refused. Zarr is read without zarr-python: plain arrays by
-`slatprep.storage.chunks`, arrays in shards like those of a store.
+type or shape than a prediction's are refused. Zarr is read by `slatprep.storage.chunks`, without
+zarr-python.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, StoreError
+from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import change_ranges
-from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing
+from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing, zarr_array
 from slatprep.readers.hdf5 import group_arrays
 from slatprep.readers.pixieverse import UNLABELLED
 from slatprep.readers.slat import check_coords
@@ -36,12 +36,9 @@ from slatprep.records import (
     Share,
     Verdict,
 )
-from slatprep.storage.chunks import MAX_CHUNK_BYTES, array_form, read_chunks
-from slatprep.storage.documents import adapter_of, read_document
-from slatprep.storage.files import LINK, LocalFolder, file_name, local_files
+from slatprep.storage.documents import adapter_of, read_bounded, read_document
+from slatprep.storage.files import file_name
 from slatprep.storage.place import storage_of
-from slatprep.store.contract import MAX_METADATA_BYTES
-from slatprep.store.shard_reader import BAD_METADATA, RowReader
 
 RUN_FILE = "run.json"
 """The parameters of a training run, beside its predictions."""
@@ -364,61 +361,21 @@ def _zarr(root: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
     group = root / file_name(asset_id)
     if not group.is_dir():
         return None
-    try:
-        return {
-            name: read_array(group / name, root, spec)
-            for name, spec in _SPECS.items()
-            if (group / name).is_dir()
-        }
-    except StoreError as error:
-        raise InputError(group, f"cannot be read ({error})", _FORMS) from None
+
+    def fetch(name: str, key: str, most: int) -> bytes:
+        if not (path := group / name / key).exists():
+            # zarr leaves out chunks of fill values, and a lost chunk must not pass as one.
+            raise InputError(f"{group} [{name}]", f"its file {name}/{key} is missing", _WHOLE)
+        return read_bounded(storage_of(root).locate(path)[0], most)
+
+    return {
+        name: zarr_array(partial(fetch, name), f"{group} [{name}]", spec, _WHOLE)
+        for name, spec in _SPECS.items()
+        if (group / name).is_dir()
+    }
 
 
-_WHOLE = 'all chunks, as zarr writes them with config={"write_empty_chunks": True}'
-
-
-def read_array(path: Path, root: Path, spec: ArraySpec) -> NDArray[Any]:
-    """Read a whole array of Zarr format 3 from the folder `path`; no link may lead out of `root`.
-
-    Raises StoreError if it is not such an array, is damaged, or compressed with another codec than
-    zstd or blosc. InputError if its type or shape is not in `spec`, or a link leads out of `root`.
-    """
-    _refuse_links_out(path, root)
-    try:
-        metadata = read_document(path / "zarr.json", MAX_METADATA_BYTES)
-        shape, dtype = array_form(metadata)
-        spec.check(path, shape, dtype)
-        if metadata["codecs"][0]["name"] == "sharding_indexed":
-            reader = RowReader.of(LocalFolder(path.parent), path.name, metadata)
-            if reader.decoder.nbytes > MAX_CHUNK_BYTES:
-                raise ValueError(f"chunks of {reader.decoder.shape}")
-            for number in range(-(-shape[0] // reader.shard_rows)):
-                if not (path.parent / (name := reader.key(number))).exists():
-                    raise InputError(path, f"its shard {name} is missing", _WHOLE)
-            return reader.read(0, shape[0])
-        folder = LocalFolder(path)
-
-        def fetch(name: str, most: int) -> bytes | None:
-            try:
-                file = folder.open(name)
-            except FileNotFoundError:
-                # zarr leaves out chunks of fill values, and a lost chunk must not pass as one.
-                what = f"its chunk {name} is missing"
-                raise InputError(path, what, _WHOLE) from None
-            with file:
-                if file.size() > most:
-                    raise ValueError(f"a chunk of {file.size()} bytes")
-                return file.pread(file.size(), 0)
-
-        return read_chunks(metadata, fetch)
-    except (*BAD_METADATA, OSError) as error:
-        raise StoreError(f"{path}: {error!r}") from None
-
-
-def _refuse_links_out(path: Path, root: Path) -> None:
-    """Raise InputError if an array's folder, or anything in it, is a link out of the root."""
-    whole = root.resolve()
-    links = (path / name for name, size in local_files(path).items() if size == LINK)
-    for place in (path, *links):
-        if not place.resolve().is_relative_to(whole):
-            raise InputError(place, f"leads to {place.resolve()}, out of its root", "a file in it")
+_WHOLE = (
+    "an array of Zarr format 3 packed with zstd, blosc or nothing, with all chunks, as zarr writes "
+    'them with config={"write_empty_chunks": True}'
+)

@@ -14,7 +14,7 @@ import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
 from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile
+from slatprep.storage.chunks import array_form, read_chunks
+from slatprep.storage.documents import parse_document
 from slatprep.storage.place import storage_of
 
 MAX_FILE_BYTES = 128 * 2**20
@@ -36,7 +38,7 @@ MAX_MEMBERS = 256
 MAX_FILES = 4096
 """Largest number of files of one asset's Zarr hierarchy."""
 
-_MAX_HEADER_BYTES = 4096
+_MAX_HEADER_BYTES, _MAX_METADATA_BYTES = 4096, 2**16
 
 _KIND_NAMES = {
     "b": "booleans",
@@ -236,6 +238,22 @@ def npz_arrays(
             name: _read_member(archive, infos[present.index(name)], where, specs[name])
             for name in wanted
         }
+
+
+def zarr_array(
+    fetch: Callable[[str, int], bytes | None], where: str | Place, spec: ArraySpec, expected: str
+) -> NDArray[Any]:
+    """Read an array of Zarr format 3, with `fetch` of `slatprep.storage.chunks.read_chunks`.
+
+    InputError, naming `where` and what is expected, if it is damaged or not as specified.
+    """
+    with refusing(where, "is no readable array", expected):
+        metadata = parse_document(fetch("zarr.json", _MAX_METADATA_BYTES) or b"")
+        spec.check(where, *array_form(metadata))
+        try:
+            return read_chunks(metadata, fetch)
+        except StoreError as error:
+            raise ValueError(str(error)) from None
 
 
 def npz_small_arrays(

@@ -23,14 +23,13 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 from numpy.typing import NDArray
 
 from slatprep import records
-from slatprep.errors import ConfigError, InputError, StoreError
+from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers import files
 from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
 from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
-from slatprep.storage.chunks import array_form, read_chunks
 from slatprep.storage.documents import adapter_of, read_bounded, unique
 from slatprep.storage.files import Listing
 
@@ -187,8 +186,8 @@ def _description(root: records.Place) -> _Description:
 
 
 _ZARR_EXPECTED = (
-    "a Zarr group of format 3 with an array for each of {}, not in shards, packed with zstd, "
-    "blosc or nothing; or npz, HDF5 or PLY"
+    "a Zarr group of format 3 with an array for each of {}, packed with zstd, blosc or "
+    "nothing; or npz, HDF5 or PLY"
 )
 
 _ALL_CHUNKS = (
@@ -225,15 +224,10 @@ def _group_arrays(
             return archive.read(path)
 
         for name, spec in specs.items():
+            here = f"{where} [{name}]"
             if f"{name}/zarr.json" not in there:
-                raise InputError(f"{where} [{name}]", "is not in it", expected)
-            with files.refusing(f"{where} [{name}]", "is no readable array", expected):
-                metadata = json.loads(fetch(name, "zarr.json", _MAX_BYTES) or b"")
-                spec.check(f"{where} [{name}]", *array_form(metadata))
-                try:
-                    arrays[name] = read_chunks(metadata, partial(fetch, name))
-                except StoreError as error:
-                    raise ValueError(str(error)) from None
+                raise InputError(here, "is not in it", expected)
+            arrays[name] = files.zarr_array(partial(fetch, name), here, spec, expected)
     return arrays
 
 

@@ -1,4 +1,4 @@
-"""Undo the codecs of Zarr's chunks, and read whole arrays of format 3 with one file per chunk.
+"""Undo the codecs of Zarr's chunks, and read whole arrays of format 3.
 
 zarr-python runs whatever codec the metadata name, and unpacks as much as a chunk claims to hold.
 This module allows a few codecs, and allocates what the array's shape allows. A chunk that claims to
@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import product
-from operator import add
+from operator import add, lt
 from typing import Any
 
 import numpy as np
@@ -168,7 +168,10 @@ _DTYPES = (
     *(f"float{bits}" for bits in (16, 32, 64)),
 )
 MAX_CHUNK_BYTES = 2**26
-_MAX_CHUNKS = 4096
+_MAX_CHUNKS = 2**16
+
+MISSING = 2**64 - 1
+"""Offset and length, in a shard, of a chunk that was never written: it holds the fill value."""
 
 
 def whole_sizes(sizes: object) -> tuple[int, ...]:
@@ -192,41 +195,77 @@ def array_form(metadata: Mapping[str, Any]) -> tuple[tuple[int, ...], np.dtype[A
     return whole_sizes(metadata["shape"]), np.dtype(metadata["data_type"])
 
 
+def inner_chunks(
+    codecs: Sequence[Mapping[str, Any]], outer: tuple[int, ...]
+) -> tuple[tuple[int, ...], Sequence[Mapping[str, Any]], bool]:
+    """Return shape and codecs of the chunks in a file, and whether it is a shard with an index.
+
+    `outer` is the shape of what a file holds. ValueError if slatprep does not read such shards.
+    """
+    if codecs[0]["name"] != "sharding_indexed":
+        return outer, codecs, False
+    sharding = codecs[0]["configuration"]
+    index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
+    at_end = sharding.get("index_location", "end") == "end"
+    if index_codecs != ["bytes", "crc32c"] or not at_end or codecs[1:]:
+        raise ValueError("shards with another index")
+    return whole_sizes(sharding["chunk_shape"]), sharding["codecs"], True
+
+
 def read_chunks(
     metadata: Mapping[str, Any], fetch: Callable[[str, int], bytes | None]
 ) -> NDArray[Any]:
-    """Read an array that has one file per chunk.
+    """Read an array of chunks, each in a file of its own or in a shard.
 
     `metadata` is its ``zarr.json``, whose shape the caller has checked. `fetch` takes the name of a
-    chunk, such as ``c/0/1``, and the largest number of bytes; it returns the bytes, or None without
-    such a chunk. StoreError, ValueError or KeyError if the metadata are invalid, or a chunk
+    file, such as ``c/0/1``, and the largest number of bytes; it returns the bytes, or None without
+    such a file. StoreError, ValueError or KeyError if the metadata are invalid, or a chunk
     contradicts them.
     """
     shape, native = array_form(metadata)
-    dtype = native.newbyteorder("<")
     steps = whole_sizes(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-    decoder = ChunkDecoder.of(dtype, steps, metadata["codecs"], 0)
+    inner, codecs, sharded = inner_chunks(metadata["codecs"], steps)
+    decoder = ChunkDecoder.of(native.newbyteorder("<"), inner, codecs, 0)
     corners = [range(0, n, step) for n, step in zip(shape, steps, strict=True)]
-    chunks = math.prod(map(len, corners))
+    parts = [range(0, step, one) for step, one in zip(steps, inner, strict=True)]
+    each = math.prod(map(len, parts))
+    chunks = math.prod(map(len, corners)) * each
     # A writer may give a short array the chunk rows of long arrays, but no chunk may be wider.
     wide = any(step > n for step, n in zip(steps[1:], shape[1:], strict=True))
-    if wide or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= MAX_CHUNK_BYTES:
-        raise ValueError(f"{chunks} chunks of {steps}")
+    uneven = any(step % one for step, one in zip(steps, inner, strict=True))
+    if wide or uneven or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= MAX_CHUNK_BYTES:
+        raise ValueError(f"{chunks} chunks of {inner} in files of {steps}")
     keys = metadata["chunk_key_encoding"]
     separator = keys.get("configuration", {}).get("separator", "/")
     if keys["name"] != "default" or separator not in ("/", "."):
         raise ValueError(f"chunks named by {keys!r}")
     array = np.full(shape, metadata["fill_value"], native)
-    block = np.empty(steps, dtype)
+    block = np.empty(inner, decoder.dtype)
+    # A chunk that did not shrink is only a little larger than its values.
+    most = min(each * (decoder.nbytes + 65_536), 2 * MAX_CHUNK_BYTES)
     for corner in product(*corners):
         places = (start // step for start, step in zip(corner, steps, strict=True))
-        # A chunk that did not shrink is only a little larger than its values.
-        data = fetch(separator.join(["c", *map(str, places)]), decoder.nbytes + 65_536)
+        data = fetch(separator.join(["c", *map(str, places)]), most)
         if data is None:
-            continue  # Zarr writes no chunk of fill values alone.
-        decoder.decode(data, block)
-        place_chunk(array, corner, block)
+            continue  # Zarr writes no file of fill values alone.
+        for part, packed in zip(product(*parts), _packed(data, each, sharded), strict=True):
+            start = tuple(map(add, corner, part))
+            if packed is not None and all(map(lt, start, shape)):
+                decoder.decode(packed, block)
+                place_chunk(array, start, block)
     return array
+
+
+def _packed(data: bytes, count: int, sharded: bool) -> Iterator[bytes | None]:
+    """Yield the packed chunks of a file, in C order; None for one that was never written."""
+    if not sharded:
+        yield data
+        return
+    index = data[-16 * count - 4 :]
+    if len(index) != 16 * count + 4 or not crc32c_holds(index):
+        raise StoreError("its shard has no sound index; it is damaged or cut short")
+    for offset, length in np.frombuffer(index, "<u8", 2 * count).reshape(-1, 2).tolist():
+        yield None if offset == length == MISSING else data[offset : offset + length]
 
 
 def place_chunk(array: NDArray[Any], corner: Sequence[int], block: NDArray[Any]) -> None:

@@ -24,12 +24,16 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.parameters import MAX_SHARD_CHUNKS
 from slatprep.records import MAX_NAME_BYTES
-from slatprep.storage.chunks import MAX_TEXT_BYTES, ChunkDecoder, crc32c_holds, whole_sizes
+from slatprep.storage.chunks import (
+    MAX_TEXT_BYTES,
+    MISSING,
+    ChunkDecoder,
+    crc32c_holds,
+    inner_chunks,
+    whole_sizes,
+)
 from slatprep.storage.place import Folder, RangeFile
 from slatprep.store.layout import MAX_RECORD_BYTES, RECORD_ARRAY
-
-MISSING = 2**64 - 1
-"""Offset and length of a chunk that was never written: it holds the fill value."""
 
 OPEN_SHARDS = 512
 """Largest number of open shards of a process, unless the system allows it few open files."""
@@ -113,15 +117,7 @@ class RowReader:
             dtype = np.dtype(object) if text else np.dtype(metadata["data_type"]).newbyteorder("<")
             shape = whole_sizes(metadata["shape"])
             outer = whole_sizes(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-            codecs, inner = metadata["codecs"], outer
-            sharded = codecs[0]["name"] == "sharding_indexed"
-            if sharded:
-                sharding = codecs[0]["configuration"]
-                inner, codecs = whole_sizes(sharding["chunk_shape"]), sharding["codecs"]
-                index_codecs = [codec["name"] for codec in sharding["index_codecs"]]
-                at_end = sharding.get("index_location", "end") == "end"
-                if index_codecs != ["bytes", "crc32c"] or not at_end or metadata["codecs"][1:]:
-                    raise ValueError("shards with another index")
+            inner, codecs, sharded = inner_chunks(metadata["codecs"], outer)
             whole_rows = outer[1:] == inner[1:] == shape[1:] and inner[0] > 0 == outer[0] % inner[0]
             if not whole_rows or metadata["chunk_key_encoding"] not in _KEYS:
                 raise ValueError("chunks that are no whole rows, or files with other names")

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from slatprep.records import Place
 from slatprep.storage.atomic import writing
-from slatprep.storage.chunks import single_threaded_blosc
+from slatprep.storage.chunks import MISSING, single_threaded_blosc
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import read_metadata
-from slatprep.store.shard_reader import MISSING, RowReader
+from slatprep.store.shard_reader import RowReader
 
 _SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
 

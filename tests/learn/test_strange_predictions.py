@@ -17,16 +17,15 @@ from support.commands import refused
 from support.memory import less_than
 from support.predictions import right, write_one, write_predictions, zeros
 
-from slatprep.errors import InputError, StoreError
+from slatprep.errors import InputError
 from slatprep.learn.decoder import make_decoder
 from slatprep.learn.metrics import evaluate_store
 from slatprep.learn.predict import checkpoint_state, load_checkpoint
-from slatprep.learn.predictions import check_prediction, read_array, selection_of_run
+from slatprep.learn.predictions import check_prediction, open_predictions, selection_of_run
 from slatprep.learn.runs import LAST
 from slatprep.learn.splits import assign_store
 from slatprep.learn.train import TrainParameters, train
 from slatprep.normalize import PIXIE_RANGES
-from slatprep.readers.files import ArraySpec
 from slatprep.readers.splits import Shares
 from slatprep.store import open_store
 
@@ -133,29 +132,33 @@ def ones(tmp_path: Path) -> Any:
     """Make an array of ones (8, 3) cut in some way, and return its folder and what reads it."""
 
     def make(**cut: Any) -> tuple[Path, Any]:
-        root = zarr.open_group(tmp_path / "p.zarr", mode="w")
-        root.create_array("a", shape=(8, 3), dtype="uint8", **cut)[:] = 1
-        folder = tmp_path / "p.zarr/a"
-        return folder, lambda: read_array(folder, folder.parent, ArraySpec(((None, 3),), "u"))
+        group = zarr.open_group(tmp_path / "p.zarr", mode="w").create_group("a")
+        group.create_array("coords", shape=(8, 3), dtype="uint8", **cut)[:] = 1
+
+        def read() -> Any:
+            with open_predictions(tmp_path / "p.zarr") as of:
+                return of("a")["coords"]
+
+        return tmp_path / "p.zarr/a/coords", read
 
     return make
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"fill_value": 300}, "OverflowError"),
+    ({"fill_value": 300}, "out of bounds"),
     ({"shape": [8.9, 3]}, "sizes are"),
     (cut(4.0, 3), "sizes are"),
-    (cut(8, 64), "chunks of|chunks that"),
+    (cut(8, 64), "chunks of"),
     ({"storage_transformers": [{"name": "x"}]}, "storage_transformers are"),
     ({"codecs": [{"name": "bytes"}, {"name": "gzip"}]}, "codecs"),
     ({"codecs": [{"name": "numcodecs.pickle"}]}, "codecs"),
     ({"zarr_format": 2}, "no array of Zarr format 3"),
     ({"shape": [2**40, 3]}, "has shape"),
-    (cut(2**40, 2**40), "chunks of|chunks that"),
-    (cut(1, 1), "it holds 12 bytes|chunks that"),
-    (cut(0, 3), "p.zarr/a"),
-    ({"chunk_grid": 5}, "p.zarr/a"),
-    ({"fill_value": "x"}, "p.zarr/a"),
+    (cut(2**40, 2**40), "chunks of"),
+    (cut(1, 1), "it holds 12 bytes|chunks of"),
+    (cut(0, 3), "must not be zero"),
+    ({"chunk_grid": 5}, "not subscriptable"),
+    ({"fill_value": "x"}, "invalid literal"),
 ])  # fmt: skip
 @pytest.mark.parametrize("shards", [None, (8, 3)])
 def test_metadata_of_arrays_are_taken_at_their_word(ones, change, message, shards):
@@ -163,23 +166,20 @@ def test_metadata_of_arrays_are_taken_at_their_word(ones, change, message, shard
     assert read().tolist() == [[1, 1, 1]] * 8
     file = folder / "zarr.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
-    with pytest.raises((StoreError, InputError), match=message):
+    with pytest.raises(InputError, match=rf"p\.zarr/a \[coords\].*({message})"):
         read()
 
 
 def test_a_lost_file_of_a_prediction_and_a_chunk_that_unpacks_to_much_are_refused(ones):
-    for shards, said in (
-        (None, r"p\.zarr/a: its chunk c/1/0 is missing"),
-        ((4, 3), "its shard a/c/1/0 is missing; expected all chunks"),
-    ):
+    for shards in None, (4, 3):
         folder, read = ones(chunks=(4, 3), shards=shards)
         (folder / "c/1/0").unlink()
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=r"its file coords/c/1/0 is missing; .* all chunks"):
             read()
         much = (2**25, 3)  # 96 MiB, of 3 kB packed
         folder, read = ones(chunks=much, shards=shards and much)
         assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) < 20_000
-        with pytest.raises(StoreError, match="chunks of"):
+        with pytest.raises(InputError, match="chunks of"):
             read()
 
 

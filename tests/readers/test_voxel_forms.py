@@ -196,9 +196,27 @@ def written_anew(array: Path, **how: Any) -> None:
     zarr.create_array(array, data=rows_of(3000)[array.name], **how)
 
 
+def in_shards(array: Path) -> None:
+    wide = rows_of(3000)[array.name].shape[1:]
+    written_anew(array, chunks=(700, *wide), shards=(2100, *wide))
+
+
+def test_arrays_in_shards_are_read_as_others_are(root):
+    sources.write_voxels(root, "a", "zarr", rows_of(3000))
+    plain = field_at(root)
+    for name in ("voxels", "density", "material"):
+        in_shards(root / "a.zarr" / name)
+    sharded = field_at(root)
+    assert sharded.sources != plain.sources
+    for name in ("voxels", "properties", "material"):
+        np.testing.assert_array_equal(getattr(sharded, name), getattr(plain, name))
+
+
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing": (shutil.rmtree, "is not in it"),
-    "shards": (lambda a: written_anew(a, chunks=(500,), shards=(3000,)), "sharding_indexed"),
+    "torn shard": (lambda a: (in_shards(a), os.truncate(a / "c/0", 500)), "no sound index"),
+    "changed shard": (lambda a: (in_shards(a), (a / "c/0").open("r+b").write(b"torn")),
+                      "cannot be unpacked|it holds"),
     "version 2": (lambda a: written_anew(a, zarr_format=2), "is not in it"),
     "codec": (edit(lambda t: t.replace('"zstd"', '"numcodecs.pickle"')), "numcodecs.pickle"),
     "rows": (edit(lambda t: json.dumps(json.loads(t) | {"shape": [2**40]})), "N <= 2097152"),
