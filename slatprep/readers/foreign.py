@@ -23,7 +23,7 @@ from slatprep.parameters import PixieverseSource
 from slatprep.readers.values import require_plausible
 from slatprep.records.json_types import Count
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
-from slatprep.storage.documents import read_as
+from slatprep.storage.documents import faults_told, read_as
 from slatprep.storage.files import Listing
 
 _MOST_TOLD = 1000
@@ -72,12 +72,15 @@ class _Foreign:
 
     def _as_recorded(self, read: _Read, **kinds: Any) -> _Read:
         """Return what was read, with files, notes and entries of these kinds as in a record."""
+        from pydantic import ValidationError
+
         held = {}
         for name, kind in {"sources": _FILES, "warnings": _TEXTS, **kinds}.items():
             try:
                 held[name] = read_as(kind, orjson.dumps(getattr(read, name)))
             except (TypeError, ValueError) as error:
-                reason = " ".join(str(error).split())
+                told = faults_told(error) if isinstance(error, ValidationError) else (str(error),)
+                reason = "; ".join(told[:3])
                 raise self._fault(f"gives {name} that no record can hold: {reason}") from None
         return replace(read, **held)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,9 +14,11 @@ from slatprep.records import Place
 from slatprep.storage.place import storage_of
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter
+    from pydantic import TypeAdapter, ValidationError
 
 _Value = TypeVar("_Value")
+
+_FAULTS = 64
 
 MAX_DEPTH = 64
 """Largest number of levels of nested objects and lists; a store's metadata have a dozen."""
@@ -86,3 +88,23 @@ def read_as(kind: type[_Value], text: bytes | str) -> _Value:
     """Read a record from its JSON; pydantic's ValidationError, a ValueError, if it is invalid."""
     read: _Value = adapter_of(kind).validate_json(text, strict=True)  # type: ignore[arg-type]
     return read
+
+
+def faults_in(error: ValidationError) -> Iterator[tuple[str, str, str]]:
+    """Yield place, message and value of each fault; the value is empty if it is missing."""
+    # A stranger's document may have any number of faults.
+    found = error.errors(include_url=False)[:_FAULTS]
+    for fault in found:
+        at = fault["loc"]
+        if any(other["loc"][: len(at)] == at != other["loc"] for other in found):
+            continue  # A list that is too short only for its faulty item is no second fault.
+        value = "" if fault["type"] == "missing" else repr(fault["input"])[:100]
+        yield "/".join(map(str, at)), fault["msg"], value
+
+
+def faults_told(error: ValidationError) -> tuple[str, ...]:
+    """Return each fault in words, with its place and value."""
+    return tuple(
+        f"{place or 'it'}: {message}{value and f', found {value}'}"
+        for place, message, value in faults_in(error)
+    )

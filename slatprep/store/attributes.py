@@ -13,10 +13,9 @@ from annotated_types import MaxLen, MinLen
 
 from slatprep import records
 from slatprep.parameters import Length, SampleParameters
-from slatprep.storage.documents import read_as
+from slatprep.storage.documents import faults_in, read_as
 from slatprep.store.contract import Finding
 from slatprep.store.layout import FORMAT, FORMAT_VERSION
-from slatprep.store.record_json import faults_in
 
 
 @dataclass(frozen=True)

@@ -6,27 +6,23 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import orjson
 
 from slatprep.errors import StoreError
 from slatprep.records import SourceFile, oddities_in
-from slatprep.storage.documents import read_as
+from slatprep.storage.documents import faults_told, read_as
 from slatprep.storage.place import is_place
 from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES
 from slatprep.store.record import AssetRecord, BuildRecord, Record
 
-if TYPE_CHECKING:
-    from pydantic import ValidationError
-
 FOLDER = Path(__file__).with_name("schema")
 
-_FAULTS = 64
 _Kind = TypeVar("_Kind")
 
 
@@ -66,11 +62,7 @@ def read_record(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
     try:
         return read_as(kind, text)
     except ValidationError as error:
-        found = [
-            f"{place or 'it'}: {message}{value and f', found {value}'}"
-            for place, message, value in faults_in(error)
-        ]
-        raise RecordError(where, tuple(found)) from None
+        raise RecordError(where, faults_told(error)) from None
 
 
 def faults_of(record: AssetRecord) -> tuple[str, ...]:
@@ -100,18 +92,6 @@ def build_id_of(head: object, digests: Iterable[tuple[str, bytes]]) -> str:
 def digest_of(text: bytes) -> bytes:
     """Return the SHA-256 of a record's text, by which builds and stores identify it."""
     return hashlib.sha256(text).digest()
-
-
-def faults_in(error: ValidationError) -> Iterator[tuple[str, str, str]]:
-    """Yield place, message and value of each fault; the value is empty if it is missing."""
-    # A stranger's document may have any number of faults.
-    found = error.errors(include_url=False)[:_FAULTS]
-    for fault in found:
-        at = fault["loc"]
-        if any(other["loc"][: len(at)] == at != other["loc"] for other in found):
-            continue  # A list that is too short only for its faulty item is no second fault.
-        value = "" if fault["type"] == "missing" else repr(fault["input"])[:100]
-        yield "/".join(map(str, at)), fault["msg"], value
 
 
 def _plain(value: object) -> Any:
