@@ -153,15 +153,15 @@ def test_lists_and_ranges_of_no_use_are_told_before_any_work(make_dataset, tmp_p
 
 
 def test_a_range_that_cuts_off_most_values_is_told(make_dataset, tmp_path):
-    dataset, file = make_dataset("a"), tmp_path / "si.toml"
+    dataset, file = make_dataset("a"), tmp_path / "high.toml"
     file.write_text(
-        "[youngs_modulus]\nlo = 1e4\nhi = 1e6\n[density]\nlo = 0.0\nhi = 9.0\n"
+        "[youngs_modulus]\nlo = 20.0\nhi = 40.0\n[density]\nlo = 0.0\nhi = 9.0\n"
         "[poissons_ratio]\nlo = 0.0\nhi = 0.5\n"
     )
     summary = build_store(of(dataset, ranges=str(file)), tmp_path / "s.zarr")
     (told,) = [one for one in summary.warnings if "beyond its range" in one]
-    assert open_store(summary.store).normalization.source == "si.toml"
+    assert open_store(summary.store).normalization.source == "high.toml"
     assert told == (
         "100% of the values of youngs_modulus are beyond its range, in log10 of the SI value, "
-        "1e+04 to 1e+06, and were set to the end of it: see normalize.ranges"
+        "20 to 40, and were set to the end of it: see normalize.ranges"
     )
