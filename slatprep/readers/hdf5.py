@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, refusing
-from slatprep.readers.patterns import components_of, expression_of
+from slatprep.readers.patterns import components_of, match
 from slatprep.records import Place, SourceFile
 from slatprep.storage.chunks import place_chunk
 from slatprep.storage.place import storage_of
@@ -121,20 +121,19 @@ def _walk_groups(
 ) -> Iterator[tuple[dict[str, str], str]]:
     import h5py
 
-    expression = expression_of(components[0], known)
     for key in group:
         # h5py gives bytes for a name that is not UTF-8.
         raw = key if isinstance(key, bytes) else key.encode()
         name = raw.decode(errors="surrogateescape")
-        match = expression.fullmatch(name)
-        if match is None or group.id.links.get_info(raw).type != h5py.h5l.TYPE_HARD:
+        fields = match(components[0], known, name)
+        if fields is None or group.id.links.get_info(raw).type != h5py.h5l.TYPE_HARD:
             continue
         if isinstance(inner := group[key], h5py.Group):
-            fields = known | match.groupdict()
             if len(components) == 1:
-                yield fields, prefix + name
+                yield known | fields, prefix + name
             else:
-                yield from _walk_groups(inner, components[1:], fields, f"{prefix}{name}/")
+                further = known | fields, f"{prefix}{name}/"
+                yield from _walk_groups(inner, components[1:], *further)
 
 
 def _child(parent: h5py.Group, name: str, where: str, kind: type, names: Iterable[str]) -> Any:
