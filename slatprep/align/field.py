@@ -80,6 +80,10 @@ CLEARLY = 2.5
 scores. A placement that fits better ties whatever its score, if this was measured."""
 
 
+BEATEN = 2 * TIE
+"""Lead in score at which another placement contradicts a stated frame."""
+
+
 class Candidates(NamedTuple):
     """Placements best first, the fits of the 24 starts, and poses of all orientations."""
 
@@ -215,15 +219,19 @@ def lead_of_another(
     latents: StructuredLatents,
     parameters: AlignParameters,
 ) -> float:
-    """Return by how much another placement scores above a given one; -inf if none fits well.
+    """Return by how much another placement scores above a given one; -inf if none can or does.
 
-    The given one may be off by `DISTINCT` at most, as both are polished.
+    The given one may be off by `DISTINCT` at most, as both are polished. If it is off farther, the
+    polished one is another placement. The search is skipped if no placement can beat the given one
+    by `BEATEN`.
     """
     pair = _pair_of(field, latents, parameters)
     given = Pose(Similarity.of(transform))
     own = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
     if pair.apart(own, given)[0] >= DISTINCT:
         own = pair.refine([given], POLISH_SAMPLES, (), 0.0)
+    if own[0].score > 1.0 - BEATEN:
+        return -inf
     others = pair.others(given, _search(pair).poses)
     well = [pose.score for pose in others if pose.score > POOR]
     return max(well, default=-inf) - own[0].score

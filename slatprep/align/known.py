@@ -11,8 +11,7 @@ from math import nan
 
 import numpy as np
 
-from slatprep.align.field import lead_of_another
-from slatprep.align.pair import TIE
+from slatprep.align.field import BEATEN, lead_of_another
 from slatprep.align.quality import measure_quality
 from slatprep.geometry.frames import split_transform
 from slatprep.parameters import AlignParameters
@@ -33,5 +32,5 @@ def align(
         search=Search.NONE,
         quality=measure_quality(field, latents, transform, parameters.radius),
         # Placements that fit as well do not count: the source says which of them is right.
-        margin=-lead if lead > TIE else nan,
+        margin=-lead if lead > BEATEN else nan,
     )

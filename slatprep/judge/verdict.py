@@ -234,7 +234,8 @@ def verdict_of(
     if alignment.margin < 0.0:
         reasons.append(
             f"another placement fits better than the stated frame, by {-alignment.margin:.3f} in "
-            "score: check its direction, its order of axes, and that it is for column vectors"
+            "score: check its shift, its direction, its order of axes, and that it is for column "
+            "vectors"
         )
     mirrored = math.nan if alignment.figures is None else alignment.figures.mirrored
     # A mirror image of another object cannot be recognised.

@@ -15,7 +15,7 @@ from support.faults import environment
 from support.shapes import GRID, chair, field_of, judged, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions, solver
-from slatprep.align.field import fitted_near
+from slatprep.align.field import BEATEN, fitted_near
 from slatprep.align.ground import RAISED
 from slatprep.align.pair import FINE_SAMPLES, TIE
 from slatprep.align.starts import distinct_starts
@@ -367,6 +367,6 @@ def test_a_stated_frame_is_held_against_the_placement_that_fits_best():
     for alignment, judgement in found[:2]:
         assert np.isnan(alignment.margin) and judgement.right_placement > 0.9
     wrong, judgement = found[2]
-    assert wrong.quality.fitness > 0.8 and wrong.margin < -TIE
+    assert wrong.quality.fitness > 0.8 and wrong.margin < -BEATEN
     assert judgement.verdict is Verdict.FAILED and judgement.right_placement < 0.1
     assert "another placement fits better than the stated frame" in " ".join(judgement.reasons)
