@@ -233,8 +233,7 @@ def lead_of_another(
     if own[0].score > 1.0 - BEATEN:
         return -inf
     others = pair.others(given, _search(pair).poses)
-    well = [pose.score for pose in others if pose.score > POOR]
-    return max(well, default=-inf) - own[0].score
+    return max((pose.score for pose in others if pose.score > POOR), default=-inf) - own[0].score
 
 
 def _figures(pair: Pair, best: Pose, deformed: Deformed, clear_by: float = nan) -> FitFigures:
