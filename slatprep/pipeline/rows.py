@@ -24,7 +24,7 @@ from slatprep.records import Contents, Finished, LatentMoments, Normalization, P
 from slatprep.store.attributes import store_attributes
 from slatprep.store.integrity import digests_in, file_findings, metadata_findings
 from slatprep.store.layout import RECORD_ARRAY, RECORDS_IN_SHARD
-from slatprep.store.reader import LostStore, Store, open_again
+from slatprep.store.reader import Store, open_again, opened_elsewhere
 from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
 from slatprep.store.records import StoredRecords
@@ -57,7 +57,8 @@ class SourceStore(Store):
         self.run = uuid.uuid4().hex
 
     def __reduce__(self) -> tuple[Callable[..., Store], tuple[object, ...]]:
-        return _in_this_process, (self.path, self.identity, self.damaged, self.run)
+        of = self.path, self.identity, self.damaged, self.run
+        return opened_elsewhere, (_in_this_process, *of)
 
     @property
     def build(self) -> dict[str, Any]:
@@ -109,10 +110,7 @@ class SourceStore(Store):
 
 @lru_cache(maxsize=16)
 def _in_this_process(path: Place, identity: str, damaged: frozenset[str], run: str) -> Store:
-    try:
-        return SourceStore(open_again(path, identity), damaged)
-    except StoreError as error:
-        return LostStore(error)
+    return SourceStore(open_again(path, identity), damaged)
 
 
 def checked_store(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import pkgutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -181,7 +181,7 @@ class Store(AssetTable):
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _opened_elsewhere, (self.path, self.identity)
+        return opened_elsewhere, (open_again, self.path, self.identity)
 
     def __iter__(self) -> Iterator[StoredAsset]:
         return (self.asset(index) for index in range(len(self)))
@@ -367,12 +367,14 @@ class LostStore(Store):
     def __getattribute__(self, name: str) -> Any:
         if name.startswith("__"):
             return super().__getattribute__(name)
-        raise self.__dict__["error"]
+        # Otherwise each use would lengthen its traceback, which keeps the callers' data alive.
+        raise self.__dict__["error"].with_traceback(None)
 
 
-def _opened_elsewhere(path: Place, identity: str) -> Store:
+def opened_elsewhere(opens: Callable[..., Store], *of: object) -> Store:
+    """Return the store that `opens` returns, or a `LostStore`, which must not be kept."""
     try:
-        return open_again(path, identity)
+        return opens(*of)
     except StoreError as error:
         return LostStore(error)
 

@@ -49,14 +49,15 @@ class ShardWriter:
         self._fill_value = layout.fill_value
         self._rows = self._chunks = self._bytes = 0
         self.file = layout.key(start // layout.shard_rows)
-        self._stack = ExitStack()
         target = storage_of(store / self.file)
-        if target.local is None:
-            self._stack.enter_context(writing(self.file, store))
-        # Beside the store, so that leftovers of a killed worker are no part of it.
-        partials = store.parent / f"{store.name}.partial"
-        partial = self._stack.enter_context(target.staged_apart(partials))
-        self._file = self._stack.enter_context(partial.open("wb"))
+        with ExitStack() as stack:
+            if target.local is None:
+                stack.enter_context(writing(self.file, store))
+            # Beside the store, so that leftovers of a killed worker are no part of it.
+            partials = store.parent / f"{store.name}.partial"
+            partial = stack.enter_context(target.staged_apart(partials))
+            self._file = stack.enter_context(partial.open("wb"))
+            self._stack = stack.pop_all()
         self._digest = hashlib.sha256()
         self._size = 0
 

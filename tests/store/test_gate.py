@@ -239,12 +239,19 @@ def test_a_store_that_was_sent_to_a_process_is_that_store_or_none(copy):
     edit_attributes(copy, manifest="0" * 64)
     lost = [pickle.loads(one) for one in sent[2:4]]
     edit_attributes(copy, manifest=opened.about.manifest)
+    assert pickle.loads(sent[3]).ids == opened.ids  # A fault that has passed is forgotten.
     rewrite(copy, "asset/id", slice(2), opened.ids[1::-1])
     lost += [pickle.loads(one) for one in sent[4:]]
     for one in lost:
         for use in (len, iter, lambda one: one.read(0), lambda one: one["ant"], pickle.dumps):
             with pytest.raises(StoreError, match=r"was the store replaced\?\); open it again"):
                 use(one)
+        depths = set[int]()
+        for _ in range(2):
+            with pytest.raises(StoreError) as told:
+                len(one)
+            depths.add(len(told.traceback))
+        assert len(depths) == 1
     shutil.rmtree(copy)
     gone = pickle.loads(sent[0])
     with pytest.raises(StoreError, match="is not a slatprep store"):

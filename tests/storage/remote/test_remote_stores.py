@@ -3,6 +3,7 @@
 import errno
 import multiprocessing
 import shutil
+import tempfile
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -30,6 +31,7 @@ from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer
+from slatprep.store.shard_writer import ShardWriter
 
 
 def test_a_store_built_from_s3_to_s3_equals_the_local_one(s3, url, uploaded, undisturbed, tmp_path):
@@ -207,6 +209,14 @@ def test_places_that_take_nothing_are_told_first(s3, bucket, undisturbed, monkey
     with pytest.raises(StoreError, match=told):
         open_store(f"s3://{bucket}/a.zarr")
     assert begun == []
+
+
+def test_a_shard_that_finds_no_temporary_file_says_so(url, undisturbed, monkeypatch, tmp_path):
+    put(undisturbed[1], url)
+    store = open_store(url).path
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(StoreError, match="voxel/valid/c/0: cannot be written to s3://"):
+        ShardWriter(store, "voxel/valid", 0)
 
 
 @pytest.mark.parametrize("use", ["build", "verify", "info"])
