@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from slatprep.export.formats import ROWS, Exported, ExportOptions, Writer, describe_columns
 from slatprep.export.target import FORMAT
-from slatprep.readers.patterns import ASSET_ID
-from slatprep.storage.files import file_name
+from slatprep.readers.hdf5 import group_name
 from slatprep.store import Store, StoredAsset
 from slatprep.store.layout import LAYOUTS, MERGED_COLUMNS
 
@@ -45,9 +44,7 @@ def write(path: Path, about: dict[str, Any], assets: Iterable[StoredAsset]) -> I
 
 
 def _write_group(file: h5py.File, asset: StoredAsset) -> None:
-    # Readers of latents take the name as the id. Other ids, such as "..", have a meaning in paths.
-    plain = ASSET_ID.fullmatch(asset.asset_id)
-    group = file.create_group(asset.asset_id if plain else file_name(asset.asset_id))
+    group = file.create_group(group_name(asset.asset_id))
     group.attrs.update(describe_columns(asset))
     for name in _DATASETS:
         if name in MERGED_COLUMNS and not asset.store.merges:

@@ -21,7 +21,7 @@ from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import change_ranges
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing, zarr_array
-from slatprep.readers.hdf5 import group_arrays
+from slatprep.readers.hdf5 import group_arrays, group_name
 from slatprep.readers.pixieverse import UNLABELLED
 from slatprep.readers.slat import check_coords
 from slatprep.readers.splits import HASH, Shares
@@ -147,8 +147,9 @@ ReadAsset = Callable[[str], Mapping[str, NDArray[Any]] | None]
 def open_predictions(path: Path) -> Iterator[ReadAsset]:
     """Open predictions of any form; yield a function that reads the arrays of an asset.
 
-    They are a folder of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5 file, with ids
-    encoded by `slatprep.storage.files.file_name`. InputError if they are none of these.
+    They are a folder of ``<asset_id>.npz``, a Zarr group of format 3, or an HDF5 file. Ids are
+    encoded by `slatprep.storage.files.file_name`, in HDF5 by `slatprep.readers.hdf5.group_name`.
+    InputError if they are none of these.
     """
     if path.is_dir():
         zarr = any((path / name).exists() for name in ("zarr.json", ".zgroup"))
@@ -294,8 +295,8 @@ class GivenPrediction:
     def classes(self, used: NDArray[np.bool_], count: int) -> NDArray[np.int64] | None:
         """Return the class (N,) of each used row, None without classes.
 
-        It is `UNLABELLED` in other rows, and where several of the `count` classes share the
-        highest score.
+        It is `UNLABELLED` in other rows, and where all `count` classes have the same score. Of
+        several highest scores the first counts: rounded ones are now and then equal.
         """
         material = np.full(len(used), UNLABELLED, dtype=np.int64)
         if "material" in self.arrays:
@@ -305,9 +306,8 @@ class GivenPrediction:
             scores = self._shaped("logits", (len(used), count))[used]
             if np.isnan(scores).any():
                 raise InputError(self.source, "logits are not all numbers", "a score a class")
-            highest = scores == scores.max(axis=1, keepdims=True)
-            single = highest.sum(axis=1) == 1
-            material[used] = np.where(single, highest.argmax(axis=1), UNLABELLED)
+            equal = (count > 1) & (scores.max(axis=1) == scores.min(axis=1))
+            material[used] = np.where(equal, UNLABELLED, scores.argmax(axis=1))
         else:
             return None
         return material
@@ -351,7 +351,7 @@ def read_npz(path: Path) -> Mapping[str, NDArray[Any]]:
 
 
 def _hdf5(file: Any, path: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
-    group = file_name(asset_id)
+    group = group_name(asset_id)
     with refusing(f"{path} [{group}]", "is damaged", _FORMS):
         there = file.id.links.exists(group.encode())
         return group_arrays(file, path, group, _SPECS, partial=True) if there else None

@@ -15,6 +15,7 @@ from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.learn.predictions import GivenPrediction, read_npz
 from slatprep.normalize import PIXIE_RANGES, denormalize_properties
+from slatprep.readers.pixieverse import UNLABELLED
 from slatprep.readers.voxel_sets import physical
 from slatprep.records import (
     BACKGROUND,
@@ -104,6 +105,10 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     material = given.classes(valid, BACKGROUND + 1)
     if material is None:
         raise InputError(path, f"has {', '.join(given.arrays)}", "material or logits as well")
+    valid &= material != UNLABELLED
+    if not valid.any():
+        fault = "all classes have the same score in every valid row"
+        raise InputError(path, fault, "logits that differ between the classes")
     if "properties_si" in given.arrays:
         values = given.finite("properties_si", valid, len(PROPERTIES)).astype(np.float32)
     elif "properties" in given.arrays:
@@ -116,7 +121,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
         values = denormalize_properties(given.normalised(valid, ranges.ranges), ranges)
     else:
         raise InputError(path, f"has {', '.join(given.arrays)}", "properties or properties_si")
-    fine = (material >= 0) & (material < BACKGROUND) & physical(values, PROPERTIES).all(axis=1)
+    fine = (material < BACKGROUND) & physical(values, PROPERTIES).all(axis=1)
     if (wrong := valid & ~fine).any():
         first = int(np.argmax(wrong))
         raise InputError(

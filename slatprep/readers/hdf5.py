@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.readers.files import ArraySpec, refusing
-from slatprep.readers.patterns import components_of, match
+from slatprep.readers.patterns import ASSET_ID, components_of, match
 from slatprep.records import Place, SourceFile
 from slatprep.storage.chunks import place_chunk
+from slatprep.storage.files import file_name
 from slatprep.storage.place import storage_of
 from slatprep.storage.states import reading
 
@@ -70,6 +71,12 @@ def load_group(
     ):
         source = _hash_shared(file.id.get_vfd_handle(), name)
         return group_arrays(file, path, group, specs), source
+
+
+def group_name(asset_id: str) -> str:
+    """Return the name of an asset's group: its id, encoded only if it is no plain name."""
+    # Readers of latents take the name as the id. Other ids, such as "..", have a meaning in paths.
+    return asset_id if ASSET_ID.fullmatch(asset_id) else file_name(asset_id)
 
 
 def group_arrays(

@@ -24,6 +24,7 @@ from support.trees import tree
 from slatprep.errors import ConfigError, SlatprepError
 from slatprep.export import FORMATS, ExportOptions, export_store
 from slatprep.export.target import directory
+from slatprep.learn.predictions import open_predictions
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
 from slatprep.readers.hdf5 import find_groups
@@ -76,6 +77,8 @@ def test_groups_of_hdf5_have_the_ids_that_readers_expect(copy, tmp_path):
     export_store(copy, tmp_path / "slat.h5", "hdf5")
     groups = find_groups(tmp_path / "slat.h5", tmp_path, "{id}", {})
     assert sorted(fields["id"] for fields, _ in groups) == sorted(names)
+    with open_predictions(tmp_path / "slat.h5") as read:
+        assert all(read(name) for name in names)
 
 
 def samples_of(folder: Path) -> list[dict[str, Any]]:

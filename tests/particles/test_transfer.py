@@ -295,9 +295,14 @@ def test_prediction_by_its_own_ranges(store, tmp_path):
         field = predicted_field(tmp_path / "p.npz", normalization)
         np.testing.assert_allclose(field.properties, asset.properties_si[asset.valid], rtol=1e-5)
         np.testing.assert_array_equal(field.material, asset.material[asset.valid])
+    scores[0], scores[1, :2] = 1.0, 2.0
+    np.savez(tmp_path / "p.npz", **arrays, ranges=spans)
+    field = predicted_field(tmp_path / "p.npz", None)
+    assert len(field.material) == len(scores) - 1
+    np.testing.assert_array_equal(field.material[0], 0)
     arrays["logits"] = np.zeros_like(scores)
     np.savez(tmp_path / "p.npz", **arrays, ranges=spans)
-    with pytest.raises(InputError, match="row 0 has class -1"):
+    with pytest.raises(InputError, match="all classes have the same score"):
         predicted_field(tmp_path / "p.npz", None)
 
 
