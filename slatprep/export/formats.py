@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError, tally
+from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.frames import voxel_centres
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, words_of
 from slatprep.store import Store, StoredAsset
@@ -69,13 +70,17 @@ def describe_columns(asset: StoredAsset) -> dict[str, Any]:
 
 
 class AnnotatedPoints(NamedTuple):
-    """Points with materials: positions (N, 3) in either frame's unit cube, SI values (N, P)."""
+    """Points with materials: positions (N, 3) in either frame's unit cube, SI values (N, P).
+
+    The `place_map` between the frames is that of a field's voxels; None for SLAT voxels.
+    """
 
     in_slat: NDArray[np.float64]
     in_pixieverse: NDArray[np.float64]
     material: NDArray[np.uint8]
     values: NDArray[np.float32]
     distance: NDArray[np.float32]
+    place_map: PlaceMap | None = None
 
     def solid(self, asset: StoredAsset) -> NDArray[np.float32]:
         """Return Young's modulus [Pa], density [kg/m^3] and Poisson's ratio, (N, 3)."""
@@ -94,14 +99,15 @@ def require_solver_classes(store: Store) -> None:
 def annotated_points(asset: StoredAsset, points: Points) -> AnnotatedPoints:
     """Return the valid SLAT voxels, or the annotated voxels of the field at distance 0."""
     if points == "grid":
-        field = asset.field
+        field, place_map = asset.field, StoredRecords(asset.store).place_map(asset)
         centres = voxel_centres(field.voxels)
         return AnnotatedPoints(
-            StoredRecords(asset.store).place_map(asset).to_slat(centres),
+            place_map.to_slat(centres),
             centres,
             field.material,
             field.properties,
             np.zeros(len(field.material), dtype=np.float32),
+            place_map,
         )
     valid = asset.valid
     return AnnotatedPoints(

@@ -24,7 +24,6 @@ from slatprep.records import COLOURS, MATERIAL_CLASSES, RESOLUTION
 from slatprep.records.yielding import MAX_POISSON, YIELDING
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
-from slatprep.store.records import StoredRecords
 
 SCENE = "scene.usda"
 
@@ -71,7 +70,7 @@ def write(
     solid[:, 2] = np.minimum(solid[:, 2], MAX_POISSON)
     name = f"{file_name(asset.asset_id)}.usdc"
     binned = bin_materials(there.material, solid, materials)
-    volumes = size**3 * _volumes(asset, points, there.in_slat)
+    volumes = size**3 * _volumes(asset, there)
     width = float(np.cbrt(volumes.mean())) if len(volumes) else size / RESOLUTION
     masses = solid[:, 1] * volumes
     places = there.in_slat * size
@@ -213,14 +212,11 @@ def _stage(path: Path, name: str) -> tuple[Any, Any]:
     return stage, root
 
 
-def _volumes(
-    asset: StoredAsset, points: formats.Points, in_slat: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _volumes(asset: StoredAsset, there: formats.AnnotatedPoints) -> NDArray[np.float64]:
     """Return the volume (N,) of each point's voxel, in the SLAT's unit cube."""
-    if points == "slat":
-        return np.full(len(in_slat), asset.store.contents.latents.resolution**-3.0)
-    place_map = StoredRecords(asset.store).place_map(asset)
-    return place_map.volume_ratios(in_slat) / RESOLUTION**3
+    if there.place_map is None:
+        return np.full(len(there.in_slat), asset.store.contents.latents.resolution**-3.0)
+    return there.place_map.volume_ratios(there.in_slat) / RESOLUTION**3
 
 
 def _remarks(entries: Sequence[dict[str, Any]]) -> tuple[str, ...]:

@@ -13,8 +13,11 @@ NUMBERS = Path(__file__).with_suffix(".json")
 """The file of the numbers."""
 
 
+_HELD = orjson.loads(NUMBERS.read_bytes())
+
+
 def _model(name: str, names: tuple[str, ...]) -> Logistic:
-    held = orjson.loads(NUMBERS.read_bytes())[name]
+    held = _HELD[name]
     curve = tuple((odds, share) for odds, share in held["curve"])
     return Logistic(names, tuple(Term(*one) for one in held["terms"]), held["intercept"], curve)
 

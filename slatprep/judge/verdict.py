@@ -192,7 +192,7 @@ def labels_word(classified: object) -> str:
 
 
 def verdict_of(
-    alignment: Alignment, judgement: Judgement, valid_share: float, labels: str = "class"
+    alignment: Alignment, judgement: Judgement, valid_share: float, labels: str
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Return the verdict on an alignment, and the reasons why it is not better.
 

@@ -251,7 +251,7 @@ def _against(
 ) -> Iterator[Array]:
     if len(latents.coords) < 2:
         return  # One voxel has no axes.
-    lattice = voxel_index_of(field)
+    index = voxel_index_of(field)
     places = places_of(latents.centres, alignment.transform)
     centre = places.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((places - centre).T))
@@ -260,7 +260,7 @@ def _against(
     blocks = cells // BLOCK @ steps
     for axis in axes.T:
         turned = centre + (places - centre) @ (2.0 * np.outer(axis, axis) - np.eye(3))
-        _, used = lattice.nearest(turned, limit=REACH)
+        _, used = index.nearest(turned, limit=REACH)
         rows = np.flatnonzero((used >= 0) & (material != UNANNOTATED))
         own, other = material[rows], field.material[used[rows]]
         differ = own != other

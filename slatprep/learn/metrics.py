@@ -211,12 +211,12 @@ def evaluate_store(
         for index in select_assets(store, split, **filters).tolist():
             asset_id = store.ids[index]
             source, ranges = f"{predictions}/{asset_id}", store.normalization
-            rows = store.read(index, COLUMNS)
             try:
                 arrays = read(asset_id)
                 if arrays is None:
                     missing.append(asset_id)
                     continue
+                rows = store.read(index, COLUMNS)
                 coords, labelled = rows["coords"], rows["valid"]
                 prediction = check_prediction(
                     source, arrays, coords, ranges, store.contents, labelled

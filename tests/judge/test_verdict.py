@@ -47,7 +47,7 @@ def said_of(
     )
     evidence = tuple(0.0 if name == worst else math.nan for name in FIGURES) if worst else ()
     known = Judgement(Ambiguity(ambiguity, (0.0,)), Verdict.GOOD, evidence=evidence, **others)
-    return verdict_of(alignment, known, valid)
+    return verdict_of(alignment, known, valid, "class")
 
 
 def judgement(verdict: Verdict, expected: float) -> Judgement:
