@@ -105,8 +105,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     material = given.classes(valid, BACKGROUND + 1)
     if material is None:
         raise InputError(path, f"has {', '.join(given.arrays)}", "material or logits as well")
-    valid &= material != UNLABELLED
-    if not valid.any():
+    if not (valid := valid & (material != UNLABELLED)).any():
         fault = "all classes have the same score in every valid row"
         raise InputError(path, fault, "logits that differ between the classes")
     if "properties_si" in given.arrays:
