@@ -11,7 +11,7 @@ from __future__ import annotations
 import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import metadata
 from typing import Any, Protocol
 
@@ -115,8 +115,12 @@ def adapter_names(group: str) -> tuple[str, ...]:
 
 def made_by(group: str, name: str) -> str:
     """Return the package of an adapter and its version; of slatprep's own, its `LIBRARIES`."""
-    own = " ".join(f"{one} {metadata.version(one)}" for one in LIBRARIES.get(name, ()))
-    return _known(group).get(name, ("", None))[1] or own
+    if group == "slatprep.sources" and name in SOURCES:
+        return " ".join(f"{one} {_version(one)}" for one in LIBRARIES.get(name, ()))
+    return _known(group).get(name, ("", None))[1] or ""
+
+
+_version = cache(metadata.version)  # Each asset asks for it.
 
 
 @lru_cache(maxsize=64)

@@ -231,7 +231,7 @@ def read_chunks(
     each = math.prod(map(len, parts))
     chunks = math.prod(map(len, corners)) * each
     # A writer may give a short array the chunk rows of long arrays, but no chunk may be wider.
-    wide = any(step > n for step, n in zip(steps[1:], shape[1:], strict=True))
+    wide = any(step > n for step, n in zip(inner[1:], shape[1:], strict=True))
     uneven = any(step % one for step, one in zip(steps, inner, strict=True))
     if wide or uneven or chunks > _MAX_CHUNKS or not 0 < decoder.nbytes <= MAX_CHUNK_BYTES:
         raise ValueError(f"{chunks} chunks of {inner} in files of {steps}")

@@ -226,12 +226,13 @@ class RowReader:
     def _shard(self, number: int) -> _Shard:
         if (known := self._shards.get(number)) is not None:
             return known
+        if self.listed is not None and self.key(number) not in self.listed:
+            index = np.full((self.chunks_per_shard, 2), MISSING, np.uint64)
+            return self._shards.setdefault(number, _Shard(None, index))
         try:
             file = self.folder.open(self.key(number))
             shard = _Shard(file, self._index(number, file, file.size()))
         except FileNotFoundError:
-            if self.listed is not None and self.key(number) not in self.listed:
-                return _Shard(None, np.full((self.chunks_per_shard, 2), MISSING, np.uint64))
             raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
             if error.errno in (errno.EMFILE, errno.ENFILE):

@@ -13,7 +13,7 @@ from support.installed import package
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents
-from slatprep.readers.adapters import FoundField, Holding, source_adapter
+from slatprep.readers.adapters import FoundField, Holding, made_by, source_adapter
 from slatprep.readers.contents import latent_space
 from slatprep.readers.foreign import ForeignLatents, ForeignSource
 from slatprep.readers.pixieverse import PixieVerse
@@ -172,3 +172,8 @@ def test_latents_have_the_name_of_their_adapter(tmp_path):
     """By another name they would be read by that one's adapter."""
     with pytest.raises(InputError, match="gives latents of 'trellis'; expected its own name"):
         latent_space(SlatSource(tmp_path, encoder="borrowed"))
+
+
+def test_a_library_is_told_of_the_adapter_alone_that_reads_by_it():
+    assert made_by("slatprep.sources", "parts").startswith("trimesh ")
+    assert made_by("slatprep.sources", "vomp") == made_by("slatprep.latents", "parts") == ""
