@@ -165,6 +165,7 @@ def _selected(
     """Return the selection of assets, by the options or by a run, and lines on omitted assets."""
     from slatprep.learn.predictions import selection_of_run
     from slatprep.learn.splits import select_assets
+    from slatprep.records import Verdict
 
     filters: dict[str, Any] = {}
     rule, how = splits.rule, f"by {splits.rule['by']}"
@@ -179,7 +180,9 @@ def _selected(
     part = None if split == "all" else split
     rows, kept = (select_assets(opened, part, splits=of_object, **own) for own in ({}, filters))
     without = {*rows.tolist()} - {*kept.tolist()}
-    left_out = options.note_left_out(output, opened, without, why=how)
+    verdicts = filters.get("verdicts") or tuple(Verdict)
+    others = f"above the ambiguity {filters.get('max_ambiguity')}"
+    left_out = options.note_left_out(output, opened, without, verdicts, how, others)
     return {"splits": of_object, **filters}, left_out
 
 

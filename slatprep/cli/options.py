@@ -243,10 +243,15 @@ def note_left_out(
     rows: Iterable[int],
     kept: Collection[str] = (),
     why: str = "--verdict all takes them",
+    others: str = "",
 ) -> list[str]:
-    """Print how many assets have a verdict that is not in `kept`; return the line, if any."""
+    """Print how many assets have a verdict that is not in `kept`; return the line, if any.
+
+    Assets of other verdicts count only if `others` says what they are.
+    """
     verdicts = store.column("verdict")
-    left = tally(one for row in rows if (one := verdicts[row]) not in kept)
+    words = (others if (one := verdicts[row]) in kept else one for row in rows)
+    left = tally(filter(None, words))
     lines = [f"left out: {left} ({why})"] if left else []
     for line in lines:
         output.note(line)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from support.commands import refused, run
+from support.made_store import rewrite
 from support.predictions import write_predictions
 from support.synthetic import Dataset, make_asset
 
@@ -359,6 +360,11 @@ def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_
     assert f"{tmp_path / 'run/predictions'}: no prediction of" in measured.stderr
     told = json.loads((tmp_path / "run" / "run.json").read_text())
     assert told["verdicts"] == ["good", "doubtful"]
+    told["max_ambiguity"] = 0.125
+    (tmp_path / "run" / "run.json").write_text(json.dumps(told))
+    rewrite(store, "asset/ambiguity", 0, 0.25)
+    measured = run("evaluate", tmp_path / "run", "--store", store, "--split", "all", code=1)
+    assert "left out: 1 above the ambiguity 0.125, 1 failed (as " in measured.stderr
 
 
 def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, tmp_path):
