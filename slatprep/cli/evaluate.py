@@ -178,8 +178,10 @@ def _selected(
     opened = options.opened(store)
     of_object = options.split_of_objects(output, opened, rule, f"{split}, {how}")
     part = None if split == "all" else split
-    rows, kept = (select_assets(opened, part, splits=of_object, **own) for own in ({}, filters))
-    without = {*rows.tolist()} - {*kept.tolist()}
+    without = set[int]()
+    if filters:
+        rows, kept = (select_assets(opened, part, splits=of_object, **own) for own in ({}, filters))
+        without = {*rows.tolist()} - {*kept.tolist()}
     verdicts = filters.get("verdicts") or tuple(Verdict)
     others = f"above the ambiguity {filters.get('max_ambiguity')}"
     left_out = options.note_left_out(output, opened, without, verdicts, how, others)

@@ -159,10 +159,10 @@ class SlatDataset(Dataset[Item]):
         self.split = split
         if split is not None and splits is None:
             splits = assign_store(self.store, shares=shares).splits
-        self.indices = select_assets(
-            self.store, split, splits=splits, verdicts=verdicts, max_ambiguity=max_ambiguity
-        )
-        self._left_out = len(select_assets(self.store, split, splits=splits)) - len(self)
+        every = select_assets(self.store, split, splits=splits)
+        fit = select_assets(self.store, verdicts=verdicts, max_ambiguity=max_ambiguity)
+        self.indices = np.intersect1d(every, fit, assume_unique=True)
+        self._left_out = len(every) - len(self)
         if len(self.indices) == 0:
             raise ConfigError(
                 f"{self.store.path} has no asset of split {split or 'all'} that passes the "

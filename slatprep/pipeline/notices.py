@@ -30,6 +30,9 @@ _BESIDE_PIXIE = 0.5
 
 _NAMED = 3
 
+_MOVED = 1e-6
+"""Largest move of an end without a notice, as a share of its range: rounding moves it less."""
+
 _MOST_CLIPPED = 0.25
 """Largest share of clipped values without a notice; usual percentiles clip a tenth or a fifth."""
 
@@ -91,10 +94,11 @@ def moved_ranges(new: Normalization, before: Mapping[str, Normalization]) -> Ite
     for where, old in before.items():
         spans = {one.name: one for one in old.ranges}
         ends = [
-            f"{end} of {span.name}{' (log10)' * span.log10} from {was:.6g} to {now:.6g}"
+            f"{end} of {span.name}{' (log10)' * span.log10} from {was:.8g} to {now:.8g}"
             for span in new.ranges
             for end in ("lo", "hi")
-            if (was := getattr(spans.get(span.name, span), end)) != (now := getattr(span, end))
+            for was, now in [(getattr(spans.get(span.name, span), end), getattr(span, end))]
+            if abs(now - was) > _MOVED * (span.hi - span.lo)
         ]
         if ends:
             moved[where] = ", ".join(ends)

@@ -227,15 +227,18 @@ class AssetTable:
         verdicts, categories = words_of(verdicts), words_of(categories)
         for one in verdicts:
             require_one_of("verdict", one, (*Verdict, "all"))
-        own = self.column("category").astype(str)
-        known = sorted(set(own.tolist()))
-        for category in sorted(set(categories).difference(known)):
-            close = difflib.get_close_matches(category, known, n=1) or list(filter(None, known))
-            expected = f"expected {', '.join(close)}" if close else "no category is known"
-            raise ConfigError(f"{self.path}: no asset has the category {category!r}; {expected}")
-        every = not verdicts or "all" in verdicts
-        judged = np.isin(self.column("verdict").astype(str), list(Verdict if every else verdicts))
-        return judged & np.isin(own, list(categories or known))
+        chosen = np.ones(len(self), bool)
+        if verdicts and "all" not in verdicts:
+            chosen &= np.isin(self.column("verdict").astype(str), list(verdicts))
+        if categories:
+            own = self.column("category").astype(str)
+            known = sorted(set(own.tolist()))
+            for one in sorted(set(categories).difference(known)):
+                close = difflib.get_close_matches(one, known, n=1) or list(filter(None, known))
+                expected = f"expected {', '.join(close)}" if close else "no category is known"
+                raise ConfigError(f"{self.path}: no asset has the category {one!r}; {expected}")
+            chosen &= np.isin(own, list(categories))
+        return chosen
 
     @property
     def _listing(self) -> str:

@@ -1,5 +1,6 @@
 """What a build tells of a dataset as a whole, and of itself at the end."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,9 @@ from support.commands import document, run
 from support.synthetic import Dataset, MakeDataset
 
 from slatprep import ConfigError, build_store
-from slatprep.normalize import ranges_from_extents
+from slatprep.normalize import PIXIE_RANGES, ranges_from_extents
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
-from slatprep.pipeline.notices import nothing_usable, wild_ranges
+from slatprep.pipeline.notices import moved_ranges, nothing_usable, wild_ranges
 from slatprep.pipeline.publish import BuildSummary, counts_of, summarise
 from slatprep.pipeline.recipe import recipe_of, record_of_failed
 from slatprep.records import AssetPair, SourceRoots, Status
@@ -35,6 +36,15 @@ def test_ranges_that_pixie_publishes_are_no_surprise():
     soft, steel = ((3.2, 4.0), (3.0, 3.0), (0.4, 0.4)), ((11.3, 11.3), (3.9, 3.9), (0.3, 0.3))
     assert told(soft, soft, soft, steel) == []
     assert told(USUAL, ((3.2, 10.8), (1.8, 9.7), (0.21, 0.45))) == []  # which of two?
+
+
+def test_an_end_that_only_rounding_moved_is_not_told():
+    def moved(by: float) -> list[str]:
+        first, *rest = PIXIE_RANGES.ranges
+        new = replace(PIXIE_RANGES, ranges=(replace(first, lo=first.lo + by), *rest))
+        return list(moved_ranges(new, {"the other": PIXIE_RANGES}))
+
+    assert moved(1e-9) == [] != moved(1e-3)
 
 
 def test_a_build_that_only_takes_assets_away_tells_of_no_range_again(make_dataset, tmp_path):

@@ -80,7 +80,7 @@ def test_ranges_that_move_are_told_and_what_follows(built, tmp_path):
     new = open_store(out).normalization.ranges[1]
     assert told == (
         "the ranges are not those of the store that was there: hi of density (log10) from "
-        f"{old.hi:.6g} to {new.hi:.6g}. All of voxel/properties are on the new scale: train anew, "
+        f"{old.hi:.8g} to {new.hi:.8g}. All of voxel/properties are on the new scale: train anew, "
         "or give fixed ranges with --ranges"
     )
     ahead = run(*words, "--ranges", "pixie", "--dry-run")

@@ -119,7 +119,7 @@ def test_a_column_of_fill_values_alone_needs_no_file(tmp_path, shard, monkeypatc
     with pytest.raises(StoreError, match="asset/category/c/1: is missing"):
         reader.read(0, 9)
     reader.listed = ()
-    monkeypatch.setattr(LocalFolder, "open", None)  # What was not written is not asked for.
+    monkeypatch.setattr(folder, "open", None)  # What was not written is not asked for.
     assert reader.read(1, 9).tolist() == [""] * 8
     with pytest.raises(StoreError, match="do not follow one another"):
         list(reader.packed(0, 1))
