@@ -36,7 +36,7 @@ from slatprep.records import (
     Share,
     Verdict,
 )
-from slatprep.storage.documents import adapter_of, read_bounded, read_document
+from slatprep.storage.documents import adapter_of, parse_document, read_bounded, read_document
 from slatprep.storage.files import file_name
 from slatprep.storage.place import storage_of
 
@@ -77,7 +77,7 @@ _SPECS = {
 """The arrays of a prediction; others are not read."""
 
 _NAMES = {"columns": ArraySpec(((range(1, MAX_PROPERTIES + 1),),), "U")}
-"""Names of the properties, in npz files."""
+"""Names of the properties, in npz files; in others they are an attribute of the properties."""
 
 
 @dataclass(frozen=True)
@@ -352,9 +352,13 @@ def read_npz(path: Path) -> Mapping[str, NDArray[Any]]:
 
 def _hdf5(file: Any, path: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
     group = group_name(asset_id)
-    with refusing(f"{path} [{group}]", "is damaged", _FORMS):
-        there = file.id.links.exists(group.encode())
-        return group_arrays(file, path, group, _SPECS, partial=True) if there else None
+    with refusing(where := f"{path} [{group}]", "is damaged", _FORMS):
+        if not file.id.links.exists(group.encode()):
+            return None
+        arrays = group_arrays(file, path, group, _SPECS, partial=True)
+        attributes = file[f"{group}/properties"].attrs if "properties" in arrays else {}
+        elsewhere = file.id.links.exists(f"{group}/columns".encode())
+        return _named(where, arrays, attributes, elsewhere)
 
 
 def _zarr(root: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
@@ -368,11 +372,34 @@ def _zarr(root: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
             raise InputError(f"{group} [{name}]", f"its file {name}/{key} is missing", _WHOLE)
         return read_bounded(storage_of(root).locate(path)[0], most)
 
-    return {
+    arrays = {
         name: zarr_array(partial(fetch, name), f"{group} [{name}]", spec, _WHOLE)
         for name, spec in _SPECS.items()
         if (group / name).is_dir()
     }
+    with refusing(group, "has damaged attributes", _WHOLE):
+        about = fetch("properties", "zarr.json", RUN_BYTES) if "properties" in arrays else b"{}"
+        attributes = parse_document(about).get("attributes") or {}
+        return _named(group, arrays, attributes, (group / "columns").exists())
+
+
+def _named(
+    source: str | Place,
+    arrays: dict[str, NDArray[Any]],
+    attributes: Mapping[str, Any],
+    elsewhere: bool,
+) -> Mapping[str, NDArray[Any]]:
+    """Add the names in the attribute ``columns`` of the properties.
+
+    ValueError if they are no text, InputError if an array ``columns`` has them (`elsewhere`).
+    """
+    if elsewhere:
+        raise InputError(source, "has an array columns", "the attribute columns of properties")
+    if (columns := attributes.get("columns")) is None:
+        return arrays
+    names = np.array(columns, dtype=str).ravel()[: MAX_PROPERTIES + 1]
+    "".join(names).encode()  # Messages show them: ValueError if they are not Unicode.
+    return arrays | {"columns": names}
 
 
 _WHOLE = (

@@ -29,6 +29,7 @@ from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
 from slatprep.readers.hdf5 import find_groups
 from slatprep.readers.splits import Shares, split_objects
+from slatprep.records import PROPERTY_COLUMNS
 from slatprep.storage.files import file_name
 from slatprep.store import Store, open_store
 
@@ -78,7 +79,7 @@ def test_groups_of_hdf5_have_the_ids_that_readers_expect(copy, tmp_path):
     groups = find_groups(tmp_path / "slat.h5", tmp_path, "{id}", {})
     assert sorted(fields["id"] for fields, _ in groups) == sorted(names)
     with open_predictions(tmp_path / "slat.h5") as read:
-        assert all(read(name) for name in names)
+        assert all(tuple(read(name)["columns"]) == PROPERTY_COLUMNS for name in names)
 
 
 def samples_of(folder: Path) -> list[dict[str, Any]]:

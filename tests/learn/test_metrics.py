@@ -16,7 +16,7 @@ import pytest
 import zarr
 from scipy.spatial import cKDTree
 from support.commands import document, refused, run
-from support.predictions import right, write_one, write_predictions
+from support.predictions import right, write_one, write_predictions, zeros
 from support.synthetic import Dataset
 
 from slatprep import InputError, open_store
@@ -27,6 +27,7 @@ from slatprep.learn.splits import assign_store
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters, NormalizeParameters
 from slatprep.pipeline.dataset import build_store
+from slatprep.records import PROPERTY_COLUMNS
 
 
 def test_objects_count_alike_whatever_their_views():
@@ -116,6 +117,34 @@ def test_columns_in_another_order_are_not_measured(learn_store, tmp_path):
     folder = write_changed(tmp_path / "p", learn_store, change)
     with pytest.raises(InputError, match="predicts density, youngs_modulus, poissons_ratio"):
         evaluate_store(folder, learn_store, None)
+
+
+@pytest.mark.parametrize("form", ["zarr", "hdf5"])
+def test_columns_of_groups_are_an_attribute(form, learn_store, tmp_path):
+    store, path, names = open_store(learn_store), tmp_path / "p", list(PROPERTY_COLUMNS)
+    for row, asset_id in enumerate(store.ids):
+        write_one(path, form, asset_id, zeros(store.read(row, ("coords",))))
+
+    def name_columns(columns: list[str]) -> None:
+        with contextlib.ExitStack() as stack:
+            file: Any
+            if form == "hdf5":
+                file = stack.enter_context(h5py.File(path, "r+"))
+            else:
+                file = zarr.open_group(path, mode="r+")
+            for asset_id in store.ids:
+                file[asset_id]["properties"].attrs["columns"] = columns
+
+    name_columns(names)
+    assert evaluate_store(path, learn_store, None).problems == []
+    name_columns(names[::-1])
+    with pytest.raises(InputError, match=f"predicts {', '.join(names[::-1])}"):
+        evaluate_store(path, learn_store, None)
+    other = tmp_path / "other"
+    arrays = zeros(store.read(0, ("coords",))) | {"columns": np.array(names)}
+    write_one(other, form, store.ids[0], arrays)
+    with pytest.raises(InputError, match="expected the attribute columns of properties"):
+        evaluate_store(other, learn_store, None)
 
 
 def test_equal_scores_are_no_class(learn_store, tmp_path):
