@@ -91,6 +91,7 @@ def finish_asset(
     try:
         with noting() as noted:
             asset = _repeated(pair, planned, context)
+            aligned = asset is None
             if asset is None:
                 asset = process_asset(pair, context.parameters)
                 damaged = "what the store holds of it is not what its record and its sources give"
@@ -107,7 +108,7 @@ def finish_asset(
     if planned.action is not Action.REUSE or planned.key != key:  # Sources changed since the plan.
         damaged = ""
     kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
-    return replace(kept, damaged=damaged, seen=as_read(pair, noted))
+    return replace(kept, damaged=damaged, seen=as_read(pair, noted), aligned=aligned)
 
 
 def fail_asset(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> FailedRecord:

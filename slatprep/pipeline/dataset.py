@@ -163,9 +163,7 @@ def build_store(
         records, spooled = None, sum(row.spooled for row in new.rows)
         if not before.holds(new):
             records = pack_store(work, place, new, crew.of(spooled))
-        aligned = sum(
-            bool(row.damaged) or plan[row.asset_id].action is Action.ALIGN for row in new.rows
-        )
+        aligned = sum(row.aligned for row in new.rows)
         summary = _publish(before, begin, new, records, failed, aligned)
         if keep_work:
             work.keep_only({row.key for row in new.rows if row.spooled})

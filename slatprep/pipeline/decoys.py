@@ -231,11 +231,8 @@ def measure_errors(
     known = {(one.grid, one.slat, one.keys): one for one in measured.decoys} if measured else {}
     found = [known.get((one.grid, one.slat, one.keys), one) for one in wanted]
     missing = [number for number, one in enumerate(found) if not one.evidence][:most_new]
-    records, row_of = StoredRecords(store), {name: row for row, name in enumerate(store.ids)}
     source = SourceStore(store)
-    tasks = (
-        (source, k, wanted[k], records.read(row_of[wanted[k].grid]).parameters) for k in missing
-    )
+    tasks = ((source, k, wanted[k], source.records.of(wanted[k].grid).parameters) for k in missing)
     for done, (number, decoy) in enumerate(run_unordered(align_decoy, tasks, jobs, fail_decoy), 1):
         found[number] = decoy
         if progress:
@@ -246,7 +243,7 @@ def measure_errors(
         evidence,
         np.array([one.evidence for one in made], dtype=np.float64),
         np.array(folds),
-        np.array([folds[row_of[one.grid]] for one in made]),
+        np.array([folds[store.find(one.grid)] for one in made]),
         good=store.column("verdict") == str(Verdict.GOOD),
         good_decoys=np.array([one.verdict == Verdict.GOOD for one in made]),
         seed=seed,

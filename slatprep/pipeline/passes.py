@@ -68,7 +68,8 @@ class Reopened:
         )
         key = hashlib.sha256(to_json(record)).hexdigest()
         put = self._spool.put(replace(record, key=key), self.field, self.latents, self.annotation)
-        return replace(put, damaged=self._asset.damaged, seen=self._asset.seen)
+        was = self._asset
+        return replace(put, damaged=was.damaged, seen=was.seen, aligned=was.aligned)
 
 
 def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> list[Row]:

@@ -167,6 +167,8 @@ class Row:
         Why, in words, an older store's data of the asset were not taken over.
     seen : bytes
         State of its sources as they were read; empty if they were not read.
+    aligned : bool
+        Whether this build aligned it; its plan may have said otherwise.
     """
 
     asset_id: str
@@ -178,6 +180,7 @@ class Row:
     names: Names | None = None
     damaged: str = ""
     seen: bytes = b""
+    aligned: bool = False
 
     @property
     def spooled(self) -> bool:

@@ -62,7 +62,7 @@ def test_killed_at_every_step(reference, old_store, step, calls):
     ends_well(dataset, out, expected)
 
 
-def test_what_was_finished_is_not_done_again(reference, tmp_path):
+def test_what_was_finished_is_not_done_again(reference, tmp_path, aligned):
     dataset, out, expected = reference
     killed = Build(dataset, out, kill_at("asset begun", 2)).done()
     assert killed.returncode == -signal.SIGKILL
@@ -70,8 +70,24 @@ def test_what_was_finished_is_not_done_again(reference, tmp_path):
     torn, *_ = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.arrays"))
     torn.write_bytes(torn.read_bytes()[:-2000])
     # One was finished, so two alignments are enough.
-    again = Build(dataset, out, kill_at("asset aligned", 2)).done()
-    assert again.returncode == 0, again.stderr
+    again = build_store(dataset.parameters("pixie"), out)
+    assert (len(aligned), again.aligned, again.taken_over) == (2, 2, 1)
+    assert tree(out) == expected
+
+
+def test_what_is_torn_after_the_plan_counts_as_aligned(reference, tmp_path, monkeypatch):
+    dataset, out, expected = reference
+    assert Build(dataset, out, kill_at("asset begun", 2)).done().returncode == -signal.SIGKILL
+    finished = sorted((tmp_path / ".s.zarr.work" / "spool").rglob("*.arrays"))
+
+    def tear(step: str, _name: str) -> None:
+        while step == "asset begun" and finished:
+            torn = finished.pop()
+            torn.write_bytes(torn.read_bytes()[:-2000])
+
+    inject(monkeypatch, tear)
+    summary = build_store(dataset.parameters("pixie"), out)
+    assert (summary.aligned, summary.taken_over) == (3, 0)
     assert tree(out) == expected
 
 
