@@ -170,6 +170,16 @@ def test_bad_ranges_are_named_by_their_file(tmp_path, name, text):
         read_ranges(tmp_path / name)
 
 
+@pytest.mark.parametrize(("values", "told"), [
+    ({"nu_max": 1e7}, r"between -1,000,000 and 1,000,000$"),
+    ({"E_max": 1e11}, r"between -50 and 50, in log10 of the SI value$"),
+])  # fmt: skip
+def test_the_bounds_of_ranges_are_told(tmp_path, values, told):
+    (tmp_path / "r.yaml").write_text(changed(**values))
+    with pytest.raises(ConfigError, match=told):
+        read_ranges(tmp_path / "r.yaml")
+
+
 @pytest.mark.parametrize("name", ["r.json", "r.yaml", "lines.yaml"])
 def test_a_number_that_is_there_twice_is_an_error(tmp_path, name):
     numbers: dict[str, object] = {**PIXIE_S_FILE}

@@ -55,10 +55,10 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
         lo, hi = (entry.get(k) if isinstance(entry, dict) else None for k in ("lo", "hi"))
         most = _MAX_LOG10 if log10 else _MAX_BOUND
         if not _is_number(lo, most) or not _is_number(hi, most) or lo >= hi:
-            mapped = f" in log10 of the SI value, at most {most:g}" if log10 else ""
+            mapped = ", in log10 of the SI value" if log10 else ""
             raise ConfigError(
                 f"{path}: {name} has lo = {lo!r} and hi = {hi!r}; expected a table [{name}] with "
-                f"finite lo < hi{mapped}"
+                f"lo < hi between {-most:,.0f} and {most:,.0f}{mapped}"
             )
         ranges.append((float(lo), float(hi)))
     return normalization_of(np.array(ranges), path.name, properties)
