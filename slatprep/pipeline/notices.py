@@ -12,7 +12,7 @@ from slatprep.align.consensus import find_consensus
 from slatprep.errors import amount
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
-from slatprep.parameters import BuildParameters
+from slatprep.parameters import AlignParameters, BuildParameters
 from slatprep.pipeline.rows import NextStore, moments_of, slat_contents
 from slatprep.readers.contents import in_words, look_standardised, pooled_moments, tell_alone
 from slatprep.readers.joins import explain_unmatched
@@ -35,6 +35,9 @@ _MOVED = 1e-6
 
 _MOST_CLIPPED = 0.25
 """Largest share of clipped values without a notice; usual percentiles clip a tenth or a fifth."""
+
+_AT_BOUND = 1e-3
+"""Largest distance from a bound, as a share of it, at which a scale counts as held by the bound."""
 
 
 def nothing_usable(
@@ -61,6 +64,7 @@ def dataset_notices(
 ) -> Iterator[str]:
     """Yield what a person should know about the assets of a store as a whole."""
     yield from latent_warnings(new, parameters.slat.standardised)
+    yield from at_scale_bounds(new, parameters.align)
     if not (parameters.consensus.settle or parameters.pixieverse.samples == "merge"):
         yield from shared_rotation(new)
     made = {row.asset_id: str(row.columns["unusual"]) for row in new.rows if row.spooled}
@@ -86,6 +90,21 @@ def much_clipped(store: Store) -> Iterator[str]:
                 f"range{unit} {span.lo:.4g} to {span.hi:.4g}, and were set to the end of it: see "
                 f"normalize.ranges{some if 0 < len(lost) < len(store) else ''}"
             )
+
+
+def at_scale_bounds(new: NextStore, parameters: AlignParameters) -> Iterator[str]:
+    """Yield a notice if the search could not give assets the scale that they may need."""
+    low, high = parameters.scale_bounds
+    scales = np.cbrt(np.linalg.det(new.column("transform")[:, :3, :3]))
+    # A scale of one needs no search, even if it is a bound.
+    bounds = [bound for bound in (low, high) if bound != 1.0]
+    ends = np.isclose(scales[:, None], bounds, rtol=_AT_BOUND).any(axis=1)
+    if parameters.engine != "known" and ends.any():
+        held = _of_assets([new.ids[row] for row in np.flatnonzero(ends)], new.ids)
+        yield (
+            f"the scale of {held} is at an end of align.scale_bounds, {low:g} to {high:g}, and "
+            "probably beyond it: compare the sizes of the two sides, or give wider bounds"
+        )
 
 
 def moved_ranges(new: Normalization, before: Mapping[str, Normalization]) -> Iterator[str]:

@@ -83,6 +83,19 @@ def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
     assert any("share the same grid (a = e" in text for text in warnings)
 
 
+def test_a_scale_beyond_the_bounds_is_told(make_dataset, tmp_path):
+    dataset = make_dataset(*"ab")
+    for bounds in ((0.6, 1.6), (1.0, 1.0)):
+        usual = dataset.parameters(align={"scale_bounds": bounds})
+        assert "scale" not in str(build_store(usual, tmp_path / "usual.zarr").warnings)
+    asset = dataset.assets["b"]
+    half = np.unique((asset.coords.astype(int) - 32) // 2 + 32, axis=0)  # a true scale of 2
+    dataset.write_slat("b.npz", half.astype(asset.coords.dtype), asset.feats[: len(half)])
+    warnings = build_store(dataset.parameters(), tmp_path / "s.zarr").warnings
+    (text,) = [text for text in warnings if "scale" in text]
+    assert text.startswith("the scale of 1 of 2 assets (b) is at an end of align.scale_bounds, 0.6")
+
+
 def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
     warn = dataset.parameters(pixieverse={"plausibility": "warn"}, ranges="pixie")
     for name in "ab":
