@@ -201,10 +201,15 @@ def compile_kernels(note: Callable[[str], None] | None = None) -> None:
     process.
     """
     start, watch = time.monotonic(), _Watch(note)
-    with event.install_listener("numba:compile", watch):
-        _process_a_bent_shape()
-    if watch.helper is not None:
-        watch.helper.wait()
+    try:
+        with event.install_listener("numba:compile", watch):
+            _process_a_bent_shape()
+        if watch.helper is not None:
+            watch.helper.wait()
+    except BaseException:
+        if watch.helper is not None:
+            watch.helper.kill()
+        raise
     if note and watch.note is None:
         note(f"compiled in {time.monotonic() - start:.0f} s")
 

@@ -2,11 +2,17 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
+import pytest
+from joblib.externals.loky import cpu_count
 from numba.core.caching import IndexDataCacheFile
+from support.faults import wait_until
 from support.synthetic import Dataset
 
 from slatprep.geometry import kernel
@@ -96,6 +102,29 @@ assert not outside_of(shell).any()
 assert outside_of(np.zeros((2, 2, 2), dtype=bool)).all()
 assert "NUMBA_CACHE_DIR" in kernels.WHEN
 """
+
+
+@pytest.mark.skipif(cpu_count() == 1, reason="one core starts no second process")
+def test_no_process_goes_on_compiling_after_an_interrupt(tmp_path):
+    code = "from slatprep.pipeline.asset import compile_kernels; compile_kernels(print)"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    words = [sys.executable, "-u", "-c", code]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, env=environment) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith(b"compiling")
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        wait_until(children.read_text)
+        (helper,) = map(int, children.read_text().split())
+        process.send_signal(signal.SIGINT)
+        assert process.wait(300) != 0
+        wait_until(lambda: not _runs(helper), 5)
+
+
+def _runs(process: int) -> bool:
+    """Return whether a process is there and is no zombie."""
+    with suppress(FileNotFoundError):
+        return ") Z " not in Path(f"/proc/{process}/stat").read_text()
+    return False
 
 
 def test_where_no_folder_can_be_written_to_kernels_are_compiled_anew():
