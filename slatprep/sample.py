@@ -11,24 +11,14 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from slatprep.normalize import from_mapped, to_mapped
 from slatprep.parameters import SampleParameters
-from slatprep.records import (
-    UNANNOTATED,
-    Annotation,
-    Contents,
-    MaterialField,
-    Property,
-)
+from slatprep.records import UNANNOTATED, Annotation, Contents, MaterialField, Property
 
 if TYPE_CHECKING:
     from slatprep.geometry.nearest import VoxelIndex
-
-NEAR_POWER, NEAR_SHARE = float(np.log10(2.0)), 0.2
-"""Largest deviation from the merged property that counts as the same: a factor of two (in log10),
-or a share of the merged value if log10 does not normalise the property."""
 
 
 def sample(
@@ -103,9 +93,7 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
     material = votes.argmax(axis=0).astype(np.uint8)
     some = (count > 0).all(axis=-1) & votes.any(axis=0)
 
-    powers = np.array([one.log10 for one in table])
-    limit = np.where(powers, NEAR_POWER, NEAR_SHARE * np.abs(mean))
-    near = (np.abs(apart) <= limit * (1.0 + 1e-6)).all(axis=-1)
+    near = (np.abs(apart) <= same_within(mean, table)).all(axis=-1)
     sure = np.stack([one.confidence for one in annotations if one.confidence is not None])
     agrees = (given == material) | (given == UNANNOTATED)
     counted = np.where(agrees & valid, np.where(near, 1.0, 0.5), 0.0)
@@ -126,6 +114,18 @@ def merge(annotations: Sequence[Annotation], table: Sequence[Property]) -> Annot
     )
 
 
+def same_within(
+    mapped: NDArray[np.float64], table: Sequence[Property], least: ArrayLike = 0.0
+) -> NDArray[np.float64]:
+    """Return the largest deviations from mapped properties (..., P) that count as the same.
+
+    That is a factor of two, a fifth of the value if log10 does not normalise the property, and at
+    least `least`. A small tolerance lets what a store rounds count as its source does.
+    """
+    limits = np.where([one.log10 for one in table], np.log10(2.0), 0.2 * np.abs(mapped))
+    return np.maximum(limits, least) * (1.0 + 1e-5)
+
+
 def lacking(field: MaterialField, contents: Contents) -> tuple[str, ...]:
     """Return the names of properties, and ``classes``, that a store has and a field lacks."""
     own = {one.name for one in field.table}
@@ -143,7 +143,6 @@ def in_table(annotation: Annotation, field: MaterialField, contents: Contents) -
     columns = [own.get(one.name, -1) for one in contents.properties]
     properties = annotation.properties[:, columns]
     properties[:, [column < 0 for column in columns]] = np.nan
-    material = annotation.material
-    if "classes" in missing:
-        material = np.full_like(material, UNANNOTATED)
+    unclassed = np.full_like(annotation.material, UNANNOTATED)
+    material = unclassed if "classes" in missing else annotation.material
     return replace(annotation, properties=properties, material=material)

@@ -54,7 +54,7 @@ def check_alignment(
     worst
         Check the N worst assets: failed first, then doubtful, each sorted by confidence.
     ambiguous
-        Check assets whose ties would change the class of more than 5 % of the voxels.
+        Check assets whose ties would change the labels of more than 5 % of the voxels.
     picture : PATH|none
         A .png, .svg or .pdf for one asset, else a folder. [default: NAME.pictures beside the store]
     show

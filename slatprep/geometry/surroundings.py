@@ -34,12 +34,11 @@ def shares_around(
     """Return how the cells at some distances from points (N, 3) are labelled.
 
     `cells` come from `labelled`, and no radius is above its reach. Each of the `radii` (voxels) is
-    a shell of `DIRECTIONS` cells; 0 is the point's own cell. Return two arrays of shares (N,
-    len(radii)). The first is the share of non-empty cells whose label differs from the point's own,
-    0 if all are empty. The second is the share of all cells that are not empty.
+    a shell of `DIRECTIONS` cells. Return two arrays of shares (N, len(radii)). The first is the
+    share of non-empty cells whose label differs from the point's own, 0 if all are empty. The
+    second is the share of all cells that are not empty.
     """
-    directions = _directions() if any(radii) else [np.zeros(3)]
-    steps = np.rint([[direction * radius for direction in directions] for radius in radii])
+    steps = np.rint([[direction * radius for direction in _directions()] for radius in radii])
     side = len(cells)
     found: tuple[NDArray[np.float32], NDArray[np.float32]] = _look(
         cells.reshape(-1), np.ascontiguousarray(points, dtype=np.float64), labels,

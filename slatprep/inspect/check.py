@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.quality import measure_quality
-from slatprep.judge import THRESHOLDS, labels_word, verdict_of
+from slatprep.judge import THRESHOLDS, verdict_of
 from slatprep.records import Consensus, Place, Verdict
 from slatprep.sample import sample
 from slatprep.store.reader import Store, StoredAsset, open_store
@@ -192,12 +192,9 @@ def check_alignment(store: Store | Place, name: str | int) -> AlignmentCheck:
     if not all(figure.ok for figure in figures):
         # The probabilities were computed for the stored fit and hold for no other.
         judgement = replace(judgement, same_object=math.nan, right_placement=math.nan)
-    labels = labels_word(store.contents.classes)
-    verdict, reasons = verdict_of(
-        replace(alignment, quality=quality), judgement, valid_share, labels
-    )
+    verdict, reasons = verdict_of(replace(alignment, quality=quality), judgement, valid_share)
     ambiguity = judgement.ambiguity.material_share
-    ties = f"the {labels} of {ambiguity:.1%} of the voxels" if ambiguity else f"no {labels}"
+    ties = f"the labels of {ambiguity:.1%} of the voxels" if ambiguity else "no labels"
     ties, settled_by = f"placements that fit as well change {ties}", {}
     if (by := alignment.settled_by) is not None:
         name = "consensus" if isinstance(by, Consensus) else "latents"

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.geometry.frames import places_of
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.parameters import SampleParameters
 from slatprep.records import Alignment, Ambiguity, Annotation, MaterialField, StructuredLatents
-from slatprep.sample import sample
+from slatprep.sample import same_within, sample
 
 NOTABLE = 0.1
 """Smallest change of a property that counts, as a share of its extent in the field."""
-
 
 MOST_VOXELS = 32_768
 """Largest number of voxels that are all compared under ties: as many as TRELLIS trains on."""
@@ -36,9 +36,9 @@ def measure_ambiguity(
     """Measure how the labels change between placements that fit about equally well.
 
     `annotation` is the lookup under the alignment's transform, with which its ``placements`` tie.
-    The share counts SLAT voxels whose class differs in any of them. Without classes it counts
-    voxels with a property that changes by more than `NOTABLE`. The change of a property is the
-    largest mean absolute change, over the voxels valid in both; of log10 if it is normalised so.
+    The share counts SLAT voxels whose class or properties differ (`far_apart`) in any of them. The
+    change of a property is the largest mean absolute change, over the voxels valid in both; of
+    log10 if it is normalised so.
     If there are more than `MOST_VOXELS` voxels, an even choice of at most a fourth of that number
     is compared.
     """
@@ -60,17 +60,28 @@ def measure_ambiguity(
             other = sample(field, places, parameters, labels_alone=True)
             differs |= other.material != material
             both = valid & other.valid
-            if both.any():
-                # Most voxels keep their properties, so log10 is taken of the changed ones only.
-                columns = zip(properties.T, other.properties.T, strict=True)
-                rows = np.flatnonzero(both & np.any([one != two for one, two in columns], axis=0))
-                mapped = to_mapped(properties[rows], field.table)
-                delta = np.abs(mapped - to_mapped(other.properties[rows], field.table))
-                change = np.maximum(change, delta.sum(axis=0) / np.count_nonzero(both))
-                if not field.classified:
-                    span = np.ptp(property_extent(field), axis=1)
-                    differs[rows] |= (delta > NOTABLE * span).any(axis=1)
+            # Most voxels keep their properties, so log10 is taken of the changed ones only.
+            columns = zip(properties.T, other.properties.T, strict=True)
+            rows = np.flatnonzero(both & np.any([one != two for one, two in columns], axis=0))
+            mapped = to_mapped(properties[rows], field.table)
+            others = to_mapped(other.properties[rows], field.table)
+            delta = np.abs(mapped - others).sum(axis=0)
+            change = np.maximum(change, delta / max(1, np.count_nonzero(both)))
+            differs[rows] |= far_apart(field, mapped, others)
     return Ambiguity(
         material_share=float(differs.mean()),
         property_change=tuple(change.tolist()),
     )
+
+
+def far_apart(
+    field: MaterialField, one: NDArray[np.float64], other: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which rows of two arrays of mapped properties (N, P) have notably different ones.
+
+    A property differs by more than counts as the same where annotations are merged, and by more
+    than `NOTABLE`.
+    """
+    least = NOTABLE * np.ptp(property_extent(field), axis=1)
+    limits = same_within(np.maximum(np.abs(one), np.abs(other)), field.table, least)
+    return np.asarray((np.abs(one - other) > limits).any(axis=1))

@@ -9,15 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
-from slatprep.judge.ambiguity import NOTABLE, thinning
+from slatprep.judge.ambiguity import NOTABLE, far_apart, thinning
 from slatprep.normalize import property_extent, to_mapped
-from slatprep.records import (
-    UNANNOTATED,
-    Alignment,
-    Annotation,
-    MaterialField,
-    StructuredLatents,
-)
+from slatprep.records import UNANNOTATED, Alignment, Annotation, MaterialField, StructuredLatents
+from slatprep.sample import voxel_index_of
 
 FIGURES = (
     "score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
@@ -53,7 +48,7 @@ MARGIN_CAP = 0.3
 """Largest margin; larger margins are reduced to it."""
 
 HARMLESS = 0.05
-"""Largest share of voxels whose class changes between ties that count as one placement."""
+"""Largest share of voxels whose labels change between ties that count as one placement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +67,8 @@ class Surroundings:
         Distance by which the deformation moves the voxel's position, in voxels.
     tied : ndarray of float32, shape (N,)
         Share of the tied placements, with the chosen one, that give the voxel another
-        class. It is 0 if a consensus or latents chose, or if the mean is at most
-        `HARMLESS`.
+        class or notably other properties. It is 0 if a consensus or latents chose, or
+        if the mean is at most `HARMLESS`.
     """
 
     others: NDArray[np.float32]
@@ -101,24 +96,33 @@ def surroundings_of(
     of_voxels, labels = _labels_of(field, annotation)
     cells = labelled(field.voxels, of_voxels, max(RADII), UNANNOTATED)
     others, solid = shares_around(cells, annotation.place, labels, RADII, UNANNOTATED)
-    count = len(annotation.place)
-    moved = np.zeros(count, dtype=np.float32)
+    moved = np.zeros(len(annotation.place), dtype=np.float32)
     if alignment.deformation is not None:
         before = places_of(latents.centres, alignment.transform).astype(np.float32)
         moved = np.linalg.norm(annotation.place - before, axis=1) / np.float32(VOXEL_SIZE)
-    tied = np.zeros(count, dtype=np.float32)
-    ties = alignment.open_placements
-    # If a SLAT has far more voxels than usual, some ties stand for all.
-    some = ties[:: thinning(count)]
-    for placement in some:
-        places = places_of(latents.centres, placement.transform).astype(np.float32)
-        tied += shares_around(cells, places, labels, (0,), UNANNOTATED)[0][:, 0]
-    if len(some) < len(ties):
-        tied *= np.float32(len(ties) / len(some))
-    tied /= np.float32(len(ties) + 1)
-    if tied.mean() <= HARMLESS:
-        tied[:] = 0.0  # Ties count as one: the chosen class is right as often.
+    tied = _tied(field, latents, alignment, annotation)
     return Surroundings(others, solid, annotation.distance, moved, tied)
+
+
+def _tied(
+    field: MaterialField, latents: StructuredLatents, alignment: Alignment, annotation: Annotation
+) -> NDArray[np.float32]:
+    """Return `Surroundings.tied` (N,)."""
+    tied = np.zeros(len(annotation.place), dtype=np.float32)
+    ties = alignment.open_placements
+    if not ties:
+        return tied
+    # If a SLAT has far more voxels than usual, some ties stand for all.
+    some = ties[:: thinning(len(tied))]
+    own, others = (to_mapped(of.properties, field.table) for of in (annotation, field))
+    for placement in some:
+        there = voxel_index_of(field).at(places_of(latents.centres, placement.transform))
+        other_class = field.material[there] != annotation.material
+        tied += (there >= 0) & (other_class | far_apart(field, own, others[there]))
+    tied *= np.float32(len(ties) / len(some) / (len(ties) + 1))
+    if tied.mean() <= HARMLESS:
+        tied[:] = 0.0  # Ties count as one: the chosen labels are right as often.
+    return tied
 
 
 def _labels_of(
@@ -188,8 +192,8 @@ def evidence_of(
 ) -> NDArray[np.float64]:
     """Return the `FIGURES` of an alignment of any engine.
 
-    `ambiguity` is the share of the voxels whose class depends on the choice among ties. Ties that
-    change nearly no class, as of a ball, count as one placement. Then ``ties`` is 0, ``margin`` and
+    `ambiguity` is the share of the voxels whose labels depend on the choice among ties. Ties that
+    change nearly none, as of a ball, count as one placement. Then ``ties`` is 0, ``margin`` and
     ``clear_by`` are NaN, and ``alike`` is 1. The same holds if a consensus or latents chose among
     ties. Figures of the agreement that were not measured are NaN.
     """

@@ -38,7 +38,7 @@ class Thresholds:
     good_valid_share : float
         Share of SLAT voxels with an annotation; below it the asset is doubtful.
     good_ambiguity : float
-        Share of SLAT voxels whose class depends on the choice among placements
+        Share of SLAT voxels whose labels depend on the choice among placements
         that fit equally well; above it the asset is doubtful.
     good_mirrored : float
         Rise of the score once one side is mirrored; above it the asset is doubtful, as the
@@ -131,7 +131,7 @@ def judge(
         evidence=tuple(evidence.tolist()),
     )
     share = float(valid.mean())
-    verdict, reasons = verdict_of(alignment, found, share, labels_word(field.classified))
+    verdict, reasons = verdict_of(alignment, found, share)
     return replace(found, verdict=verdict, reasons=reasons), likely
 
 
@@ -186,13 +186,8 @@ def voxel_confidence(
     return class_confidence(around, confidence, annotation.valid)
 
 
-def labels_word(classified: object) -> str:
-    """Return the word for what voxels of a dataset get: a class or, without classes, properties."""
-    return "class" if classified else "properties"
-
-
 def verdict_of(
-    alignment: Alignment, judgement: Judgement, valid_share: float, labels: str
+    alignment: Alignment, judgement: Judgement, valid_share: float
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Return the verdict on an alignment, and the reasons why it is not better.
 
@@ -228,7 +223,7 @@ def verdict_of(
     if tied:
         others = "another placement fits" if ties == 1 else f"{ties} other placements fit"
         reasons.append(
-            f"{others} about as well and would change the {labels} of {ambiguity:.1%} of "
+            f"{others} about as well and would change the labels of {ambiguity:.1%} of "
             f"the voxels (good needs {limits.good_ambiguity:.0%})"
         )
     if alignment.margin < 0.0:

@@ -108,7 +108,7 @@ ARRAYS = (
     _asset("margin", "float64",
         "score above the next distinct placement; below 0 where another beats a stated frame"),
     _asset("ambiguity", "float64",
-        "share of SLAT voxels whose class differs between placements that fit about as well"),
+        "share of SLAT voxels whose labels differ between placements that fit about as well"),
     _asset("property_ambiguity", "float64",
         "mean change of each normalised property between placements that fit about as well",
         "property"),

@@ -21,6 +21,8 @@ from slatprep.judge.evidence import (
     labels_hold,
     surroundings_of,
 )
+from slatprep.parameters import SampleParameters
+from slatprep.sample import sample
 
 UPSIDE_DOWN = np.diag([-1.0, 1.0, -1.0, 1.0])
 FAR_OFF = make_transform(np.eye(3), [0.5, 0.5, 0.5])
@@ -48,7 +50,7 @@ def column(
     solid[31:33, 32, 22:42] = True  # so that `UPSIDE_DOWN` keeps its shape
     field = field_of(solid, np.where(GRID[..., 2] < 22 + painted, 3, 1))
     latents = latents_of(field.voxels)
-    return field, latents, annotated(field.material, latents.centres)
+    return field, latents, sample(field, latents.centres, SampleParameters())
 
 
 NOTHING = np.zeros(4, np.float32)
@@ -163,7 +165,8 @@ def test_ties_that_change_few_classes_count_as_one():
     tied = surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied
     assert tied.mean() == pytest.approx(8 / 40 / 2)
     one = np.where(np.arange(40) == 0, 3, 1).astype(np.uint8)  # two voxels change: 2 / 40 / 2
-    field, annotation = replace(field, material=one), replace(annotation, material=one)
+    field = replace(field, material=one, properties=np.ones_like(field.properties))
+    annotation = sample(field, latents.centres, SampleParameters())
     assert not surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied.any()
 
 

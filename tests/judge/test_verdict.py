@@ -12,7 +12,7 @@ from slatprep.align import align
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import cube_symmetries, make_transform
 from slatprep.judge import THRESHOLDS, judge, measure_ambiguity, verdict_of
-from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, thinning
+from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, far_apart, thinning
 from slatprep.judge.evidence import FIGURES, surroundings_of
 from slatprep.judge.verdict import contradicted, merged
 from slatprep.parameters import AlignParameters, SampleParameters
@@ -22,7 +22,9 @@ from slatprep.records import (
     FitFigures,
     Judgement,
     MaterialField,
+    Property,
     Quality,
+    StructuredLatents,
     Verdict,
 )
 from slatprep.sample import sample
@@ -47,7 +49,7 @@ def said_of(
     )
     evidence = tuple(0.0 if name == worst else math.nan for name in FIGURES) if worst else ()
     known = Judgement(Ambiguity(ambiguity, (0.0,)), Verdict.GOOD, evidence=evidence, **others)
-    return verdict_of(alignment, known, valid, "class")
+    return verdict_of(alignment, known, valid)
 
 
 def judgement(verdict: Verdict, expected: float) -> Judgement:
@@ -117,7 +119,7 @@ def test_every_reason_is_named_once():
         "60.0% of the SLAT boundary lies within 1.5 voxel of the other side before any deformation",
         "only 70.0% of the labels can be expected to be right (good needs 75%)",
         "only 70.0% of the SLAT voxels found an annotation (good needs 80%)",
-        "2 other placements fit about as well and would change the class of 40.0% of the voxels "
+        "2 other placements fit about as well and would change the labels of 40.0% of the voxels "
         "(good needs 5%)",
         "its latents contradict its labels: labels drawn at random would be likelier",
     )
@@ -266,6 +268,60 @@ def test_a_ball_with_a_painted_half_is_not_harmless():
     np.testing.assert_allclose(ambiguity.property_change, (2.0, np.log10(2), 0.02), rtol=1e-5)
 
 
+def _two_metals(second: tuple[float, float, float]) -> tuple[MaterialField, StructuredLatents]:
+    """Return a bar of one class whose halves along x have different properties, and its surface."""
+    bar = np.zeros((64, 64, 64), dtype=bool)
+    bar[12:52, 24:40, 28:36] = True
+    field = field_of(bar, np.ones((64, 64, 64), dtype=int))
+    left = field.voxels[:, :1] < 32
+    properties = np.where(left, (6e10, 2700.0, 0.3), second).astype(np.float32)
+    return replace(field, properties=properties), surface_latents(bar)
+
+
+@pytest.mark.parametrize("classified", [True, False])
+def test_ties_that_change_properties_within_a_class_are_not_harmless(classified):
+    field, latents = _two_metals((2e11, 7800.0, 0.3))
+    field = replace(field, classified=classified, material=field.material * classified)
+    alignment = align(field, latents, AlignParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), PARAMETERS)
+    judgement, likely = judge(field, latents, alignment, annotation, PARAMETERS)
+    assert judgement.ambiguity.material_share == 1.0
+    assert judgement.verdict is Verdict.DOUBTFUL
+    assert any("would change the labels of 100.0%" in reason for reason in judgement.reasons)
+    # Two of the three ties and the chosen placement swap the ends: half of the labels are right.
+    assert len(alignment.placements) == 3
+    np.testing.assert_allclose(surroundings_of(field, latents, alignment, annotation).tied, 0.5)
+    assert likely.mean() < 0.55
+
+
+@pytest.mark.parametrize("classified", [True, False])
+@pytest.mark.parametrize("factor", [1.0 + 1e-6, 1.8])
+def test_ties_that_change_properties_by_less_than_a_factor_of_two_are_harmless(classified, factor):
+    field, latents = _two_metals((6e10 * factor, 2700.0 / factor, 0.3))
+    field = replace(field, classified=classified, material=field.material * classified)
+    alignment = align(field, latents, AlignParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), PARAMETERS)
+    judgement, _ = judge(field, latents, alignment, annotation, PARAMETERS)
+    assert len(alignment.placements) == 3
+    assert judgement.ambiguity.material_share == 0.0
+    assert judgement.verdict is Verdict.GOOD
+    assert not surroundings_of(field, latents, alignment, annotation).tied.any()
+
+
+def test_rows_are_far_apart_by_hand():
+    """The second property, of extent [-1, 1], is not mapped: only a change of 0.2 can count."""
+    field, _ = _two_metals((2e11, 7800.0, 0.3))
+    table = (Property("E", "Pa", True), Property("charge", "C", False))
+    ends = np.where(field.voxels[:, :1] < 32, (6e10, -1.0), (2e11, 1.0)).astype(np.float32)
+    field = replace(field, properties=ends, table=table)
+    one = np.array([[10.0, 0.0], [10.0, 0.0], [10.0, 0.05], [10.0, 0.05], [10.0, 1.0], [10.0, 1.0]])
+    two = np.array(
+        [[10.3, 0.0], [10.31, 0.0], [10.0, -0.1], [10.0, 0.26], [10.0, 0.81], [10, 0.79]]
+    )
+    expected = [False, True, False, True, False, True]
+    assert far_apart(field, one, two).tolist() == far_apart(field, two, one).tolist() == expected
+
+
 def test_a_box_with_a_painted_end_by_hand():
     # 40 x 20 x 10: half turns about each axis keep it, and two of the three swap the ends.
     box = np.zeros((64, 64, 64), dtype=bool)
@@ -348,6 +404,6 @@ def test_without_classes_a_property_that_changes_notably_counts_by_hand():
     ambiguity = measure_ambiguity(field, latents, half_a_turn, annotation, PARAMETERS)
     assert ambiguity.material_share == pytest.approx((4 + 2) / 10)
     reasons = judge(field, latents, half_a_turn, annotation, PARAMETERS)[0].reasons
-    assert any("would change the properties of 60.0% of the voxels" in one for one in reasons)
+    assert any("would change the labels of 60.0% of the voxels" in one for one in reasons)
     expected = ((1 + 0.05 + 0.05 + 1) / 4, 0.0, 0.0)
     np.testing.assert_allclose(ambiguity.property_change, expected, atol=1e-6)

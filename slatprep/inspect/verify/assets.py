@@ -173,7 +173,8 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
     if asset.merged:
         return
     field, properties = asset.normalised_field, asset.properties
-    if not field.classified:  # With classes, the confidence comes from classes alone.
+    # The confidence comes from classes alone, if there are any and nothing ties.
+    if not field.classified or record.alignment.open_placements:
         if asset.store.cached_column("clipped_grid")[asset.index].any():
             return  # The confidence came from values that the store does not hold.
         field, properties = asset.field, asset.properties_si

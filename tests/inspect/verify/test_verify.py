@@ -12,10 +12,12 @@ import pytest
 from support.commands import document, refused, run
 from support.faults import flip
 from support.made_store import edit_json, edit_record, placed, rewrite
+from support.shapes import surface_latents
 
 from slatprep.errors import StoreError
 from slatprep.inspect.verify import Finding, SourceRoots, index_findings, verify_store
 from slatprep.inspect.verify.manifests import manifest_findings
+from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
 
 
@@ -387,3 +389,28 @@ def test_the_command_names_findings_and_sets_the_exit_code(store):
     told = document("verify", store, "-q", code=1)
     assert told["ok"] is False
     assert {"voxel/feats/c/1/0"} == {finding["file"] for finding in told["findings"]}
+
+
+def test_ties_that_change_properties_within_a_class_verify_as_they_were_built(make_dataset):
+    """Of two bars one changes by exactly a factor of two, which rounding must not decide."""
+    dataset = make_dataset()
+    grid = np.zeros((64, 64, 64, 4), dtype=np.float32)
+    grid[..., 3] = 7
+    bar = np.zeros((64, 64, 64), dtype=bool)
+    bar[12:52, 24:40, 28:36] = True
+    latents = surface_latents(bar)
+    for name, second in (("alloys", 2 * 7e10), ("metals", 2e11)):
+        grid[12:52, 24:40, 28:36] = 2700.0, 7e10, 0.3, 1
+        grid[32:52, 24:40, 28:36, 1] = second
+        dataset.write_grid(name, grid)
+        dataset.write_slat(f"{name}.npz", latents.coords, latents.feats)
+    path = dataset.root / "store.zarr"
+    build_store(dataset.parameters(), path)
+    opened = open_store(path)
+    assert opened.column("ambiguity").tolist() == [0.0, 1.0]
+    assert opened.column("verdict").tolist() == ["good", "doubtful"]
+    assert found(path) == ()
+    half = {name: opened[name].confidence.mean() for name in opened.ids}
+    assert half["metals"] == pytest.approx(half["alloys"] / 2, rel=0.1)
+    rewrite(path, "voxel/confidence", slice(0, None), 0.9)
+    assert {one.asset for one in of_file(found(path), "voxel/confidence")} == {"alloys", "metals"}

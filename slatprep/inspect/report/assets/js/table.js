@@ -33,7 +33,7 @@ const Table = (() => {
     fitness_backward: "Share of SLAT voxels with a PixieVerse boundary voxel within the radius, before any deformation",
     inlier_rmse: "Root mean square distance of those, in voxels",
     valid_share: "Share of SLAT voxels that are valid: that found an annotation",
-    ambiguity: "Share of SLAT voxels whose class depends on the choice among tied placements",
+    ambiguity: "Share of SLAT voxels whose labels depend on the choice among tied placements",
     displacement: "Largest distance between tied placements, in voxels",
     tilt: "Angle to the nearest quarter turn",
     annotations: "Annotations of the object that its labels are merged of, and how many there are",
