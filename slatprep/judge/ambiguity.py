@@ -30,15 +30,15 @@ def measure_ambiguity(
     field: MaterialField,
     latents: StructuredLatents,
     alignment: Alignment,
-    annotation: Annotation,
     parameters: SampleParameters,
 ) -> Ambiguity:
     """Measure how the labels change between placements that fit about equally well.
 
-    `annotation` is the lookup under the alignment's transform, with which its ``placements`` tie.
-    The share counts SLAT voxels whose class or properties differ (`far_apart`) in any of them. The
+    The alignment's transform is compared with the ``placements`` that tie, without a deformation,
+    as they have none. The share counts SLAT voxels that have `other_labels` in any of them. The
     change of a property is the largest mean absolute change, over the voxels valid in both; of
     log10 if it is normalised so.
+
     If there are more than `MOST_VOXELS` voxels, an even choice of at most a fourth of that number
     is compared.
     """
@@ -49,39 +49,35 @@ def measure_ambiguity(
     differs = np.zeros(len(centres), dtype=bool)
     change = np.zeros(len(field.table))
     if alignment.placements:
-        if alignment.deformation is not None:
-            # The other placements have no deformation, so the best one is compared without it.
-            places = places_of(latents.centres, alignment.transform)
-            annotation = sample(field, places, parameters, labels_alone=True)
-        material, valid = annotation.material[few], annotation.valid[few]
-        properties = annotation.properties[few]
-        for placement in alignment.placements:
-            places = places_of(centres, placement.transform)
-            other = sample(field, places, parameters, labels_alone=True)
-            differs |= other.material != material
-            both = valid & other.valid
-            # Most voxels keep their properties, so log10 is taken of the changed ones only.
-            columns = zip(properties.T, other.properties.T, strict=True)
-            rows = np.flatnonzero(both & np.any([one != two for one, two in columns], axis=0))
-            mapped = to_mapped(properties[rows], field.table)
-            others = to_mapped(other.properties[rows], field.table)
-            delta = np.abs(mapped - others).sum(axis=0)
-            change = np.maximum(change, delta / max(1, np.count_nonzero(both)))
-            differs[rows] |= far_apart(field, mapped, others)
+        transforms = alignment.transform, *(one.transform for one in alignment.placements)
+        best, *others = (
+            sample(field, places_of(centres, transform), parameters, labels_alone=True)
+            for transform in transforms
+        )
+        mapped = to_mapped(best.properties, field.table)
+        for other in others:
+            differs |= other_labels(field, best, other)
+            delta = np.abs(mapped - to_mapped(other.properties, field.table))
+            both = best.valid & other.valid
+            change = np.maximum(change, delta[both].sum(axis=0) / max(1, np.count_nonzero(both)))
     return Ambiguity(
         material_share=float(differs.mean()),
         property_change=tuple(change.tolist()),
     )
 
 
-def far_apart(
-    field: MaterialField, one: NDArray[np.float64], other: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Return which rows of two arrays of mapped properties (N, P) have notably different ones.
+def other_labels(field: MaterialField, one: Annotation, other: Annotation) -> NDArray[np.bool_]:
+    """Return which voxels (N,) have another class, or notably other properties, in `other`.
 
-    A property differs by more than counts as the same where annotations are merged, and by more
-    than `NOTABLE`.
+    A property, compared where both are valid, must differ by more than counts as the same where
+    annotations are merged, and by more than `NOTABLE`.
     """
+    differs: NDArray[np.bool_] = one.material != other.material
+    # Most voxels keep their properties, so log10 is taken of the changed ones only.
+    changed = (one.properties != other.properties).any(axis=1)
+    rows = np.flatnonzero(changed & ~differs & one.valid & other.valid)
+    first, second = (to_mapped(of.properties[rows], field.table) for of in (one, other))
     least = NOTABLE * np.ptp(property_extent(field), axis=1)
-    limits = same_within(np.maximum(np.abs(one), np.abs(other)), field.table, least)
-    return np.asarray((np.abs(one - other) > limits).any(axis=1))
+    limits = same_within(np.maximum(np.abs(first), np.abs(second)), field.table, least)
+    differs[rows] = (np.abs(first - second) > limits).any(axis=1)
+    return differs

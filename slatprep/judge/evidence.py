@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
-from slatprep.judge.ambiguity import NOTABLE, far_apart, thinning
+from slatprep.judge.ambiguity import NOTABLE, other_labels, thinning
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import UNANNOTATED, Alignment, Annotation, MaterialField, StructuredLatents
 from slatprep.sample import voxel_index_of
@@ -114,11 +114,11 @@ def _tied(
         return tied
     # If a SLAT has far more voxels than usual, some ties stand for all.
     some = ties[:: thinning(len(tied))]
-    own, others = (to_mapped(of.properties, field.table) for of in (annotation, field))
     for placement in some:
         there = voxel_index_of(field).at(places_of(latents.centres, placement.transform))
-        other_class = field.material[there] != annotation.material
-        tied += (there >= 0) & (other_class | far_apart(field, own, others[there]))
+        properties, material = field.properties[there], field.material[there]
+        held = replace(annotation, properties=properties, material=material)
+        tied += (there >= 0) & other_labels(field, annotation, held)
     tied *= np.float32(len(ties) / len(some) / (len(ties) + 1))
     if tied.mean() <= HARMLESS:
         tied[:] = 0.0  # Ties count as one: the chosen labels are right as often.

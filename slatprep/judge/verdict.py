@@ -105,7 +105,7 @@ def judge(
     from slatprep.judge.confidence import class_confidence
     from slatprep.judge.evidence import FIGURES, evidence_of, surroundings_of
 
-    ambiguity = measure_ambiguity(field, latents, alignment, annotation, parameters)
+    ambiguity = measure_ambiguity(field, latents, alignment, parameters)
     around = surroundings_of(field, latents, alignment, annotation)
     evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
     same, placed = (float(one.probability(evidence)) for one in (SAME_OBJECT, PLACEMENT))

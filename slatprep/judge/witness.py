@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, expit, logsumexp, softmax
 
 from slatprep.geometry.frames import Array, places_of
+from slatprep.judge.ambiguity import other_labels
 from slatprep.judge.evidence import HARMLESS
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
@@ -51,7 +52,7 @@ RARE = 0.005
 likely than classes drawn at random."""
 
 OTHER_LABELS = 0.01
-"""Largest share of voxels whose class differs between placements with the same labels."""
+"""Largest share of voxels that differ between placements with the same labels."""
 
 BLOCK = 8
 """Edge, in voxels, of a block that counts as one observation."""
@@ -118,7 +119,7 @@ class LatentEvidence:
         Log likelihood under each placement, the chosen one first, over the voxels that
         have a class under all placements; K is 1 without ties.
     differing : ndarray of int64, shape (K, K)
-        Number of these voxels whose class differs between two placements.
+        Number of these voxels whose class or properties differ between two placements.
     voxels : int
         Number of these voxels.
     gain : float
@@ -221,18 +222,18 @@ def weigh(
     `material` (N,) are its labels, 255 for none. The model must come from other objects.
     """
     likely = model.log_likelihood(latents.feats)
-    labels = material[None]
+    labels, differing = material[None], np.zeros((1, 1), dtype=np.int64)
     if alignment.placements:
         # The other placements have no deformation, so the best one is compared without it.
         tied = (alignment.transform, *(p.transform for p in alignment.placements))
         places = (places_of(latents.centres, transform) for transform in tied)
-        labels = np.stack([sample(field, place, parameters).material for place in places])
-    shared = (labels != UNANNOTATED).all(axis=0)
-    rows = np.flatnonzero(shared)
+        found = [sample(field, place, parameters) for place in places]
+        labels = np.stack([one.material for one in found])
+        some = (labels != UNANNOTATED).all(axis=0)
+        others = [[other_labels(field, one, two)[some].sum() for two in found] for one in found]
+        differing = np.array(others)
+    rows = np.flatnonzero((labels != UNANNOTATED).all(axis=0))
     support = np.array([likely[rows, one[rows]].sum() for one in labels])
-    differing = np.array(
-        [[np.count_nonzero(one[rows] != two[rows]) for two in labels] for one in labels]
-    )
     return LatentEvidence(
         support,
         differing,

@@ -12,7 +12,7 @@ from slatprep.align import align
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import cube_symmetries, make_transform
 from slatprep.judge import THRESHOLDS, judge, measure_ambiguity, verdict_of
-from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, far_apart, thinning
+from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, other_labels, thinning
 from slatprep.judge.evidence import FIGURES, surroundings_of
 from slatprep.judge.verdict import contradicted, merged
 from slatprep.parameters import AlignParameters, SampleParameters
@@ -248,8 +248,7 @@ PARAMETERS = SampleParameters()
 def _ambiguity(occupancy: np.ndarray, material: np.ndarray | None = None) -> tuple[Any, Ambiguity]:
     field, latents = field_of(occupancy, material), surface_latents(occupancy)
     alignment = align(field, latents, AlignParameters())
-    annotation = sample(field, map_of(alignment).places(latents.coords), PARAMETERS)
-    return alignment, measure_ambiguity(field, latents, alignment, annotation, PARAMETERS)
+    return alignment, measure_ambiguity(field, latents, alignment, PARAMETERS)
 
 
 def test_a_ball_of_one_material_is_ambiguous_and_harmless():
@@ -308,18 +307,32 @@ def test_ties_that_change_properties_by_less_than_a_factor_of_two_are_harmless(c
     assert not surroundings_of(field, latents, alignment, annotation).tied.any()
 
 
-def test_rows_are_far_apart_by_hand():
+def test_other_labels_by_hand():
     """The second property, of extent [-1, 1], is not mapped: only a change of 0.2 can count."""
     field, _ = _two_metals((2e11, 7800.0, 0.3))
     table = (Property("E", "Pa", True), Property("charge", "C", False))
     ends = np.where(field.voxels[:, :1] < 32, (6e10, -1.0), (2e11, 1.0)).astype(np.float32)
     field = replace(field, properties=ends, table=table)
-    one = np.array([[10.0, 0.0], [10.0, 0.0], [10.0, 0.05], [10.0, 0.05], [10.0, 1.0], [10.0, 1.0]])
-    two = np.array(
-        [[10.3, 0.0], [10.31, 0.0], [10.0, -0.1], [10.0, 0.26], [10.0, 0.81], [10, 0.79]]
+    rows = [
+        # class, E, charge, and the same of the other, and whether they are other labels
+        (1, 1e10, 0.0, 1, 2.0e10, 0.0, False),
+        (1, 1e10, 0.0, 1, 2.1e10, 0.0, True),
+        (1, 1e10, 0.05, 1, 1e10, -0.1, False),
+        (1, 1e10, 0.05, 1, 1e10, 0.26, True),
+        (1, 1e10, 1.0, 1, 1e10, 0.81, False),
+        (1, 1e10, 1.0, 1, 1e10, 0.79, True),
+        (1, 1e10, 0.0, 2, 1e10, 0.0, True),
+        (1, 1e10, 0.0, 255, np.nan, np.nan, True),
+        (255, np.nan, np.nan, 255, np.nan, np.nan, False),
+    ]
+    numbers = np.array(rows)
+    one, two = (
+        annotated(part[:, 0], properties=part[:, 1:].astype(np.float32))
+        for part in (numbers[:, :3], numbers[:, 3:6])
     )
-    expected = [False, True, False, True, False, True]
-    assert far_apart(field, one, two).tolist() == far_apart(field, two, one).tolist() == expected
+    expected = [row[-1] for row in rows]
+    assert other_labels(field, one, two).tolist() == expected
+    assert other_labels(field, two, one).tolist() == expected
 
 
 def test_a_box_with_a_painted_end_by_hand():
@@ -353,7 +366,7 @@ def test_a_full_slat_is_judged_by_some_of_its_voxels_and_ties(monkeypatch):
     assert [thinning(n) for n in (1, MOST_VOXELS, MOST_VOXELS + 1)] == [1, 1, 2]
 
     def judged() -> tuple[Ambiguity, np.ndarray]:
-        ambiguity = measure_ambiguity(field, latents, alignment, annotation, PARAMETERS)
+        ambiguity = measure_ambiguity(field, latents, alignment, PARAMETERS)
         return ambiguity, surroundings_of(field, latents, alignment, annotation).tied
 
     some = judged()
@@ -369,7 +382,6 @@ def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(m
     full = np.ones((64, 64, 64), dtype=bool)
     field = field_of(full, np.where(GRID[..., 2] % 8 == 0, 1, 3))
     latents = latents_of(np.argwhere(full))
-    annotation = sample(field, latents.centres, PARAMETERS)
     looked: list[int] = []
 
     def counted(field: MaterialField, places: np.ndarray, *rest: Any, **options: Any) -> Annotation:
@@ -378,10 +390,10 @@ def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(m
 
     monkeypatch.setattr("slatprep.judge.ambiguity.sample", counted)
     upside_down = aligned(np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0]))
-    some = measure_ambiguity(field, latents, upside_down, annotation, PARAMETERS)
+    some = measure_ambiguity(field, latents, upside_down, PARAMETERS)
     # Layers 0, 8, 16... change with layers 7, 15, 23...: two of eight.
     assert some.material_share == pytest.approx(0.25, abs=0.01)
-    assert looked == [pytest.approx(MOST_VOXELS / FEWER, rel=0.05)]
+    assert looked == [pytest.approx(MOST_VOXELS / FEWER, rel=0.05)] * 2
 
 
 def test_without_classes_a_property_that_changes_notably_counts_by_hand():
@@ -401,7 +413,7 @@ def test_without_classes_a_property_that_changes_notably_counts_by_hand():
     latents = latents_of(field.voxels)
     half_a_turn = aligned(np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]))
     annotation = sample(field, latents.centres, PARAMETERS)
-    ambiguity = measure_ambiguity(field, latents, half_a_turn, annotation, PARAMETERS)
+    ambiguity = measure_ambiguity(field, latents, half_a_turn, PARAMETERS)
     assert ambiguity.material_share == pytest.approx((4 + 2) / 10)
     reasons = judge(field, latents, half_a_turn, annotation, PARAMETERS)[0].reasons
     assert any("would change the labels of 60.0% of the voxels" in one for one in reasons)

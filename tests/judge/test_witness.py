@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -431,6 +432,20 @@ def test_latents_that_know_classes_choose_the_right_one_of_two_placements():
         box_of = {tuple(c): m for c, m in zip(box.latents.coords, box.material, strict=True)}
         turned = [box_of[(x, 63 - y, 63 - z)] for x, y, z in box.latents.coords.astype(int)]
         assert choice.voxels == np.count_nonzero(np.array(turned) != box.material)
+
+
+def test_latents_leave_ties_open_that_change_properties_within_a_class():
+    """Of three placements one is upside down, and one has the same classes, from x to -x."""
+    models, reliability = models_of(telling)
+    sideways = np.diag([-1.0, -1.0, 1.0, 1.0])
+    for number, changes in [(100, False), (101, True)]:
+        box = Asset(number, telling, boxy=True)
+        left = box.field.voxels[:, :1] < 32
+        factors = np.where(left, 1.0, (3.0 if changes else 1.9, 1.0, 1.0))
+        properties = (box.field.properties * factors).astype(np.float32)
+        box.field = replace(box.field, properties=properties)
+        choice = choice_of(box.evidence(models, np.eye(4), UPSIDE_DOWN, sideways), reliability)
+        assert (choice is None) is changes
 
 
 @pytest.mark.parametrize("latents", [noise, shuffled, of_object])
