@@ -206,7 +206,7 @@ class SlatDataset(Dataset[Item]):
             torch.from_numpy(np.where(valid[:, None], rows["properties"], np.float32(0))),
             torch.from_numpy(material),
             torch.from_numpy(valid),
-            torch.from_numpy(confidence),
+            torch.from_numpy(np.where(valid, confidence, np.float32(0))),
         )
 
     def _symmetry(self, asset_id: str, draw: Draw) -> np.ndarray:

@@ -232,7 +232,7 @@ def test_voxels_that_are_not_sure_enough_are_left_out(learn_store, tmp_path):
         kept = asset.valid & (asset.confidence >= least)
         np.testing.assert_array_equal(item.valid.numpy(), kept)
         np.testing.assert_array_equal(whole.valid.numpy(), asset.valid)
-        np.testing.assert_array_equal(item.confidence.numpy(), asset.confidence)
+        np.testing.assert_array_equal(item.confidence.numpy(), np.where(kept, asset.confidence, 0))
         np.testing.assert_array_equal(item.material.numpy() != learn.IGNORED, kept)
         assert not item.properties.numpy()[~kept].any()
 
