@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf, nan
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -219,21 +219,23 @@ def lead_of_another(
     latents: StructuredLatents,
     parameters: AlignParameters,
 ) -> float:
-    """Return by how much another placement scores above a given one; -inf if none can or does.
+    """Return by how much another placement clearly beats a given one in score; NaN if none does.
 
-    The given one may be off by `DISTINCT` at most, as both are polished. If it is off farther, the
-    polished one is another placement. The search is skipped if no placement can beat the given one
-    by `BEATEN`.
+    The given one may be off by `DISTINCT` at most, as it is polished. If it is off farther, the
+    polished one is another placement, and beats it if it halves what the score lacks of 1. Others
+    beat it by `BEATEN`; the search is skipped if none can.
     """
     pair = _pair_of(field, latents, parameters)
     given = Pose(Similarity.of(transform))
-    own = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
-    if pair.apart(own, given)[0] >= DISTINCT:
-        own = pair.refine([given], POLISH_SAMPLES, (), 0.0)
-    if own[0].score > 1.0 - BEATEN:
-        return -inf
-    others = pair.others(given, _search(pair).poses)
-    return max((pose.score for pose in others if pose.score > POOR), default=-inf) - own[0].score
+    (own,) = pair.refine([given], POLISH_SAMPLES, (), 0.0)
+    (near,) = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
+    if pair.apart([near], given)[0] < DISTINCT:
+        own = near
+    elif near.score > 0.5 * (1.0 + own.score):
+        return near.score - own.score
+    least = max(POOR, own.score + BEATEN)
+    others = pair.others(given, _search(pair).poses) if least < 1.0 else []
+    return max((pose.score - own.score for pose in others if pose.score > least), default=nan)
 
 
 def _figures(pair: Pair, best: Pose, deformed: Deformed, clear_by: float = nan) -> FitFigures:

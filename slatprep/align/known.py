@@ -7,11 +7,9 @@ placement that fits clearly better, the margin is negative.
 
 from __future__ import annotations
 
-from math import nan
-
 import numpy as np
 
-from slatprep.align.field import BEATEN, lead_of_another
+from slatprep.align.field import lead_of_another
 from slatprep.align.quality import measure_quality
 from slatprep.geometry.frames import split_transform
 from slatprep.parameters import AlignParameters
@@ -24,7 +22,6 @@ def align(
     """Take the frame that the field states; see `slatprep.align.align`."""
     transform = np.eye(4) if field.frame is None else field.frame
     _, _, scale = split_transform(transform)
-    lead = lead_of_another(transform, field, latents, parameters)
     return Alignment(
         transform=transform,
         engine=Engine.KNOWN,
@@ -32,5 +29,5 @@ def align(
         search=Search.NONE,
         quality=measure_quality(field, latents, transform, parameters.radius),
         # Placements that fit as well do not count: the source says which of them is right.
-        margin=-lead if lead > BEATEN else nan,
+        margin=-lead_of_another(transform, field, latents, parameters),
     )

@@ -348,6 +348,21 @@ def test_an_engine_that_is_not_installed_names_its_extra(monkeypatch, engine, ex
             call()
 
 
+@pytest.mark.parametrize("slid", [1, 2, 3, 4])
+def test_a_stated_frame_that_slides_along_a_rod_is_beaten_by_the_one_that_does_not(slid):
+    """Most of a rod stays where it was, so its score hardly falls; its bands of classes move."""
+    rod = np.zeros((64,) * 3, dtype=bool)
+    rod[2:62, 31:33, 31:33] = True
+    latents = surface_latents(rod)
+    field = field_of(rod, np.where(GRID[..., 0] // 8 % 2 == 0, 1, 3))
+    field = replace(field, frame=make_transform(np.eye(3), [slid / 64, 0.0, 0.0]))
+    alignment = align(field, latents, AlignParameters(engine="known"))
+    # Up to 1.5 voxels a placement counts as right.
+    assert np.isnan(alignment.margin) if slid == 1 else alignment.margin < 0.0
+    good = judged(field, latents, alignment).verdict is Verdict.GOOD
+    assert good is (slid == 1)
+
+
 def test_a_stated_frame_is_held_against_the_placement_that_fits_best():
     # A block and its half-turn differ by a knob alone.
     occupancy = np.zeros((64,) * 3, dtype=bool)
