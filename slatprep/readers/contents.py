@@ -17,7 +17,15 @@ from slatprep.parameters import BuildParameters, SlatSource
 from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, source_adapter
 from slatprep.readers.files import refusing
 from slatprep.readers.plausible import ENOUGH
-from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
+from slatprep.records import (
+    PROPERTIES,
+    Contents,
+    LatentMoments,
+    LatentSpace,
+    Place,
+    Property,
+    labels_of,
+)
 from slatprep.records.encoders import LATENTS
 from slatprep.storage.documents import adapter_of, read_document
 from slatprep.storage.place import place_of
@@ -39,7 +47,8 @@ def contents_of(parameters: BuildParameters) -> Contents:
     Raises
     ------
     ConfigError
-        If a source has no usable description, or a further source has other properties or classes.
+        If a source has no usable description, describes one of `PROPERTIES` in another unit, or a
+        further source has other properties or classes.
     """
     held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
     for number, source in enumerate(parameters.also, 1):
@@ -49,6 +58,13 @@ def contents_of(parameters: BuildParameters) -> Contents:
             raise ConfigError(
                 f"[[also]] {number} ({source.root}): {fault}; expected what [pixieverse] has, or "
                 "a part of it: name the source that has most as [pixieverse]"
+            )
+    units = {one.name: one.unit for one in PROPERTIES}
+    for one in held.properties:
+        if one.unit != (known := units.get(one.name, one.unit)):
+            raise ConfigError(
+                f"{parameters.pixieverse.root}: has {one.name} in {one.unit}; expected {known}. If "
+                f"the values have another unit, say so by units in [pixieverse]"
             )
     try:
         labels_of(held.classes)

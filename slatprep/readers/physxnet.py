@@ -32,7 +32,7 @@ from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
 from slatprep.readers.files import ArraySpec, load_source, npy_array, refusing, require_complete
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import field_of_voxels
-from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place
+from slatprep.records import PROPERTIES, RESOLUTION, AssetPair, MaterialField, Place, oddity
 from slatprep.storage.files import Listing
 
 _ROWS = ArraySpec(shapes=((None, 14),), kinds="f", note=", as PhysX-3D's toolkit writes it")
@@ -144,7 +144,8 @@ class Parts(SourceAdapter):
                 raise InputError(path, f"part {label} has no mesh", expected)
             meshes.append(_mesh(*read[label][:2]))
         voxels, owner = _voxels(meshes, path)
-        return field_of_voxels(
+        extra = sorted(read.keys() - {str(part["label"]) for part in rows})
+        field = field_of_voxels(
             path,
             voxels,
             np.array(values)[owner],
@@ -152,14 +153,19 @@ class Parts(SourceAdapter):
             sources=(file, *(source for _, _, source in read.values())),
             roots=pair.roots,
         )
+        if extra:
+            text = f"{path.name} has no part of the meshes {', '.join(extra)}, which are left out"
+            field = replace(field, warnings=(*field.warnings, oddity("places", text)))
+        return field
 
 
 def _parts_of(data: bytes, path: Place) -> list[dict[str, Any]]:
     """Return the parts of a JSON, each with a label."""
     with refusing(path, "is no annotation of parts", 'an object with "parts", each with "label"'):
         parts = orjson.loads(data)["parts"]
-        if not all(isinstance(part["label"], int) for part in parts):
-            raise TypeError("a label is no integer")
+        labels = [part["label"] for part in parts]
+        if not all(type(label) is int for label in labels) or len({*labels}) < len(labels):
+            raise TypeError(f"the labels {labels} are not integers, each of one part")
     if not 0 < len(parts) <= _MAX_PARTS:
         raise InputError(path, f"has {len(parts)} parts", f"1 to {_MAX_PARTS}")
     return list(parts)
@@ -174,6 +180,9 @@ def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float
     known = {"": bare, **units}
     if match is None or unit not in known:
         expected = " or ".join(["a number", *units])
+        raise InputError(path, f"part {part['label']} has {key} {given!r}", expected)
+    if stated and unit:
+        expected = f"a bare number, or no unit of {name} in [pixieverse]"
         raise InputError(path, f"part {part['label']} has {key} {given!r}", expected)
     return float(match[1]) * (1.0 if stated else known[unit])
 

@@ -12,11 +12,12 @@ from functools import partial
 from itertools import permutations, product
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.records import LOG10, PROPERTIES, Units, oddity, to_si
 
-_EXTENTS = (
+EXTENTS = (
     # The softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry and
     # Physics).
     (1.0, 2e12),
@@ -32,12 +33,15 @@ ENOUGH = 64
 """Number of voxels below which coordinates and moments allow no conclusion."""
 
 
-def low_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
-    """Warn if voxels (N, 3) lie in the lowest eighth of a grid, as on a grid of half the side."""
-    most = voxels.max()
-    if len(voxels) < ENOUGH or most >= side // 2:
+def coarse_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
+    """Warn if voxels (N, 3) fill an eighth of a grid: its lowest one, or every second cell."""
+    every_second = (np.ptp(voxels % 2, axis=0) == 0).all()
+    if len(voxels) < ENOUGH or (voxels.max() >= side // 2 and not every_second):
         return []
-    text = f"no coordinate is above {most}, as on a grid of {side // 2}^3, and {side}^3 is read"
+    where = f"no coordinate is above {voxels.max()}"
+    if every_second:
+        where = "along each axis all coordinates are even, or all are odd"
+    text = f"{where}, as on a grid of {side // 2}^3, and {side}^3 is read"
     return [oddity("places", f"{text}; {way}")]
 
 
@@ -93,7 +97,7 @@ class Part(NamedTuple):
 
 def beyond_all(part: Part) -> str:
     """Say which value of a part is outside the range of all materials; empty if none is."""
-    for one, (least, most), value in zip(PROPERTIES, _EXTENTS, part.values, strict=True):
+    for one, (least, most), value in zip(PROPERTIES, EXTENTS, part.values, strict=True):
         if value < least or value > most:
             unit = "" if one.unit == "1" else f" {one.unit}"
             known = f"{least:g} to {most:g}{unit}"

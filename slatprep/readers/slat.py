@@ -14,7 +14,7 @@ from slatprep.geometry.voxels import flat_index
 from slatprep.readers.contents import in_words, look_standardised
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays
 from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays, load_group
-from slatprep.readers.plausible import ENOUGH, low_places
+from slatprep.readers.plausible import ENOUGH, coarse_places
 from slatprep.records import (
     RESOLUTION,
     TRELLIS,
@@ -63,6 +63,10 @@ COORDS = ArraySpec(shapes=((None, 3), (None, 4)), kinds="iu")
 
 _LARGEST = 1e4
 """Largest usual latent: the latents of known encoders have a spread of some units."""
+
+_SPREADS = 0.2, 1.4
+"""Usual spreads of an asset's latents over the encoder's: real ones have 0.5 to 1, those that were
+standardised once 0.3, twice 0.12, and those that were scaled back once too often 1.6."""
 
 _MANY_EMPTY = 0.05
 """Largest usual share of rows of zeros; encoders give none."""
@@ -163,13 +167,19 @@ def checked_latents(
         f"({', '.join(fits) or 'a JSON file that describes it'}). That holds for all objects, so "
         "give those of another grid a dataset of their own"
     )
-    warnings += low_places(latents.coords, space.resolution, way)
+    warnings += coarse_places(latents.coords, space.resolution, way)
     enough = len(coords) >= ENOUGH and not space.standardised
     if enough and look_standardised(latents.moments, space):
         warnings.append(
             f"feats look standardised already ({in_words(latents.moments)}); "
             "slat.standardised says whether they are"
         )
+    if len(coords) >= ENOUGH and space.mean:
+        usual = np.ones(space.channels) if space.standardised else np.array(space.std)
+        spread = float(np.median(np.array(latents.moments.std) / usual))
+        if spread > 0.0 and not _SPREADS[0] <= spread <= _SPREADS[1]:
+            what = f"feats spread {spread:.2g} times as far as those of {space.encoder} do"
+            warnings.append(oddity("latents", f"{what}: were they standardised or scaled twice?"))
     return replace(latents, warnings=tuple(warnings))
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import InputError
 from slatprep.readers.plausible import (
+    EXTENTS,
     Part,
     beyond_all,
     fault_of,
@@ -82,7 +83,8 @@ def require_plausible(
     faults = [(part, fault) for part in parts if (fault := fault_of(part, roots.units))]
     if not faults:
         odd = [(part, told) for part in parts if (told := oddity_of(part, roots.units))]
-        return [oddity("values", f"{_named(part)} has {told}") for part, told in odd]
+        unusual = [oddity("values", f"{_named(part)} has {told}") for part, told in odd]
+        return unusual + _strays(values, table)
     share = sum(part.share for part, _ in faults)
     (part, fault), *_ = sorted(faults, key=lambda one: -one[0].share)
     stated = in_toml(vars(roots.units))
@@ -180,13 +182,7 @@ def _parts(
 ) -> list[Part]:
     """Return the medians of each class in a sample of voxels, without classes below `_FEW`."""
     chosen = _sampled(len(values))
-    sample = values[chosen].astype(np.float64)
-    columns = {one.name: (k, one.unit) for k, one in enumerate(table)}
-    own = np.full((len(sample), len(PROPERTIES)), np.nan)
-    for k, known in enumerate(PROPERTIES):
-        column, unit = columns.get(known.name, (-1, ""))
-        if column >= 0 and unit in ("1", *FACTORS):
-            own[:, k] = to_si(sample[:, column], unit)
+    own = _known(values[chosen], table)
     ids = np.full(len(own), -1) if material is None else material[chosen].astype(int)
     if np.unique(ids, return_counts=True)[1].max() < _FEW * len(ids):
         ids[:] = -1  # No class counts alone among so many: compare the object as a whole.
@@ -201,6 +197,31 @@ def _parts(
         name = classes[k] if 0 <= k < len(classes) else ""
         parts.append(Part(name, share, *medians))
     return parts
+
+
+def _known(values: NDArray[np.float32], table: Sequence[Property]) -> NDArray[np.float64]:
+    """Return `PROPERTIES` (K, 3) in SI units from values (K, P), NaN where the table lacks one."""
+    columns = {one.name: (k, one.unit) for k, one in enumerate(table)}
+    own = np.full((len(values), len(PROPERTIES)), np.nan)
+    for k, known in enumerate(PROPERTIES):
+        column, unit = columns.get(known.name, (-1, ""))
+        if column >= 0 and unit in ("1", *FACTORS):
+            own[:, k] = to_si(values[:, column].astype(np.float64), unit)
+    return own
+
+
+def _strays(values: NDArray[np.float32], table: Sequence[Property]) -> list[str]:
+    """Warn of moduli and densities that no material has, as of parts in another unit."""
+    own = _known(values[_sampled(len(values))], table)
+    told = []
+    for one, (least, most), column in zip(PROPERTIES[:2], EXTENTS, own.T, strict=False):
+        # Others are unphysical, which the reader tells.
+        stray = column[(column > 0) & np.isfinite(column) & ((column < least) | (column > most))]
+        if len(stray) >= _FEW * len(column):
+            known = f"{least:g} to {most:g} {one.unit}"
+            share = f"{len(stray) / len(column):.0%} of the voxels have a {one.title}"
+            told.append(oddity("values", f"{share} such as {stray[0]:.3g}; materials have {known}"))
+    return told
 
 
 def _named(part: Part) -> str:

@@ -12,7 +12,7 @@ from slatprep import records
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index, voxels_of
 from slatprep.normalize import from_mapped, to_mapped
-from slatprep.readers.plausible import low_places
+from slatprep.readers.plausible import coarse_places
 from slatprep.readers.values import require_plausible
 
 MAX_RESOLUTION = 512
@@ -44,15 +44,20 @@ def field_of_voxels(
     voxels' most frequent class (the lowest at a tie) and the mean properties of that class's
     voxels. The mean is in log10 for properties that are normalised in log10. InputError if there is
     no voxel, one is out of range, or too many are unphysical. `names` are the classes' names;
-    `roots` state the units of the values and how implausible ones are treated. If a file
-    `description` states the resolution, a voxel may not occur twice with different values, and
-    voxels that fill only an eighth of the grid give a warning.
+    `roots` state the units of the values and how implausible ones are treated. An integer voxel may
+    not occur twice with different values. Integer voxels that fill only an eighth of the grid give
+    a warning, which names the file `description` if one states the resolution.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
-    once = bool(description) and np.asarray(voxels).dtype.kind != "f"
+    once = np.asarray(voxels).dtype.kind != "f"
     if once and (roots is None or roots.plausibility != "off"):
-        notes += low_places(cells, resolution, f"say the grid's own resolution in {description}")
+        way = (
+            f"say the grid's own resolution in {description}"
+            if description
+            else (f"make it anew with voxels of {resolution}^3")
+        )
+        notes += coarse_places(cells, resolution, way)
     given = np.zeros(count, np.int64) if material is None else np.asarray(material)
     with np.errstate(invalid="ignore"):
         own = given.astype(np.int64)

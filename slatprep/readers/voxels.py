@@ -69,11 +69,15 @@ class _Description:
 
     @property
     def table(self) -> tuple[records.Property, ...]:
-        """The properties, as records."""
-        return tuple(
-            records.Property(one.name, one.unit, one.scale == "log10", one.least, one.most)
-            for one in self.properties
-        )
+        """The properties, as records; known ones have the usual bounds if none are stated."""
+        table = []
+        for one in self.properties:
+            made = records.Property(one.name, one.unit, one.scale == "log10", one.least, one.most)
+            usual = [known for known in records.PROPERTIES if known.name == one.name]
+            if usual and (one.least, one.most) == (-np.inf, np.inf):
+                made = replace(made, least=usual[0].least, most=usual[0].most)
+            table.append(made)
+        return tuple(table)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -259,6 +263,10 @@ class VoMP(SourceAdapter):
             wanted = f"numbers named x, y, z, {', '.join(columns)}"
             raise InputError(f"{path} [voxel_data]", f"has the columns {rows.dtype}", wanted)
         positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        if not (finite := np.isfinite(positions).all(axis=1)).all():
+            row = int(np.argmin(finite))
+            fault = f"position {positions[row].tolist()} in row {row} is not finite"
+            raise InputError(f"{path} [voxel_data]", fault, "x, y and z in [-0.5, 0.5]")
         return field_of_voxels(
             path,
             # The dataset states lower corners, i / 64 - 0.5; predictions state centres.

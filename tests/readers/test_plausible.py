@@ -97,6 +97,17 @@ def test_stray_voxels_decide_nothing(read):
     assert told(field) == []
 
 
+@pytest.mark.parametrize(("column", "factor", "said"), [
+    (1, 1e-9, "45% of the voxels have a Young's modulus such as 0.002"),
+    (0, 1e3, "45% of the voxels have a density such as 1e+06"),
+])  # fmt: skip
+def test_a_part_of_a_class_in_another_unit_is_told(read, column, factor, said):
+    grid = grid_of((JELLY, 2e6, 1000, 0.4))
+    grid[10, 10:28, 10:50, column] *= factor
+    (text,) = told(read(grid=grid))
+    assert text.startswith(f"unusual values: {said}") and "materials have" in text
+
+
 RIGHT = [(JELLY, 2e6, 930, 0.49), (STATIONARY, 1.1e10, 700, 0.35), (METAL, 2e11, 7850, 0.29)]
 """Rubber, oak and steel."""
 UNITS = {

@@ -176,6 +176,22 @@ def test_latents_that_no_encoder_gives_are_told(make_pair):
     assert read_latents(make_pair(**few)).warnings == ()
 
 
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda raw: raw, ""),
+    (lambda raw: 0.5 * raw, ""),  # An object whose voxels are much alike.
+    (lambda raw: (raw - FEATS_MEAN) / FEATS_STD, ""),  # Once: a build tells.
+    (lambda raw: ((raw - FEATS_MEAN) / FEATS_STD - FEATS_MEAN) / FEATS_STD, "feats spread 0.1"),
+    (lambda raw: raw * FEATS_STD + FEATS_MEAN, "feats spread 2"),
+    (lambda raw: 100 * raw, "feats spread 1"),
+])  # fmt: skip
+def test_latents_that_were_scaled_twice_are_told(change, said, make_pair):
+    whole = cloud(count=2000)
+    feats = change(whole["feats"]).astype(np.float32)
+    read = read_latents(make_pair(**whole | {"feats": feats}))
+    told = [text for text in read.warnings if "unusual latents" in text]
+    assert len(told) == bool(said) and said in "".join(told)
+
+
 def test_missing_array_and_group(make_pair):
     pair = make_pair()
     for missing, arrays in (("feats", {"coords": COORDS}), ("coords", {"feats": FEATS})):

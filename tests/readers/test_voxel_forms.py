@@ -22,6 +22,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import AlignParameters, BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.readers.adapters import find_grids
+from slatprep.readers.contents import contents_of
 from slatprep.readers.files import load_source
 from slatprep.records import Engine
 from slatprep.store import open_store
@@ -143,6 +144,44 @@ def test_a_resolution_that_is_not_the_voxels_own_is_told(root):
     sources.write_voxels(root, "a", "npz", rows_of(300))
     (told, *_) = field_at(root).warnings
     assert "as on a grid of 64^3, and 128^3 is read" in told and "source.json" in told
+
+
+def test_voxels_of_vomp_on_every_second_cell_or_with_two_values_are_told(tmp_path):
+    rows = {name: column[:500] for name, column in rows_of(500, 32).items()}
+    coarse = rows | {"voxels": 2 * rows["voxels"]}
+    write_vomp(tmp_path / "coarse", coarse)
+    (told,) = field_at(tmp_path / "coarse", "vomp").warnings
+    assert "all coordinates are even, or all are odd, as on a grid of 32^3" in told
+    twice = {name: np.concatenate([column, column[:1]]) for name, column in rows.items()}
+    twice["density"][-1] = 9000.0
+    write_vomp(tmp_path / "twice", twice)
+    with pytest.raises(InputError, match="rows 0 and 500 are of one voxel, and differ"):
+        field_at(tmp_path / "twice", "vomp")
+    data = np.load(tmp_path / "coarse" / "a_with_materials.npz")["voxel_data"]
+    data["y"][3] = np.nan
+    np.savez(tmp_path / "coarse" / "a_with_materials.npz", voxel_data=data)
+    with pytest.raises(InputError, match=r"position \[.*nan.*\] in row 3 is not finite"):
+        field_at(tmp_path / "coarse", "vomp")
+
+
+def test_poissons_ratio_of_any_source_has_the_bounds_of_a_material_unless_others_are_stated(root):
+    ratio = {"name": "poissons_ratio", "unit": "1", "scale": "linear"}
+    rows = rows_of(300)
+    rows["poissons_ratio"] = np.where(np.arange(300) < 100, 0.9, 0.3).astype(np.float32)
+    sources.write_voxels(root, "a", "npz", rows)
+    sources.write_description(root, (*TABLE, ratio), CLASSES)
+    with pytest.raises(InputError, match="100 of 300 annotated voxels are unphysical"):
+        field_at(root)
+    sources.write_description(root, (*TABLE, ratio | {"least": -1, "most": 1}), CLASSES)
+    assert field_at(root).unphysical == 0
+
+
+def test_a_known_property_in_another_unit_is_refused(root):
+    modulus = {"name": "youngs_modulus", "unit": "GPa", "scale": "log10"}
+    sources.write_description(root, (*TABLE, modulus), CLASSES)
+    source = PixieverseSource(root, adapter="voxels")
+    with pytest.raises(ConfigError, match="has youngs_modulus in GPa; expected Pa"):
+        contents_of(BuildParameters(source, SlatSource(root)))
 
 
 def test_rows_and_voxels_of_physxnet_belong_together(tmp_path):
@@ -345,6 +384,27 @@ def test_units_may_be_stated_in_the_definition(tmp_path):
     root = write_object(tmp_path, [(stuff, cuboid(*CUBE))])
     field = field_at(root, "parts", youngs_modulus="MPa", density="kg/m^3")
     np.testing.assert_allclose(field.properties[0], [2e11, 7800, 0.29])
+    # A unit behind a number is another statement.
+    root = write_object(tmp_path / "both", [(HANDLE, cuboid(*CUBE))])
+    with pytest.raises(InputError, match=r"has density '7.8 g/cm.3'; expected a bare number"):
+        field_at(root, "parts", density="kg/m^3")
+
+
+def test_parts_and_meshes_belong_together_one_by_one(tmp_path):
+    root = write_object(tmp_path, [(HANDLE, cuboid(*CUBE)), (HEAD, cuboid((1, 0, 0), (2, 1, 1)))])
+    about = root / "finaljson" / "a.json"
+    document = json.loads(about.read_text())
+    for labels in ([1, 1], [0, True]):
+        for part, label in zip(document["parts"], labels, strict=True):
+            part["label"] = label
+        about.write_text(json.dumps(document))
+        with pytest.raises(InputError, match="are not integers, each of one part"):
+            field_at(root, "parts")
+    document["parts"] = document["parts"][:1]
+    document["parts"][0]["label"] = 0
+    about.write_text(json.dumps(document))
+    (told,) = field_at(root, "parts").warnings
+    assert told == "unusual places: a.json has no part of the meshes 1, which are left out"
 
 
 @pytest.mark.parametrize(("key", "value", "said"), [
