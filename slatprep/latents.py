@@ -61,6 +61,9 @@ class LatentsReader:
             begin = time.perf_counter()
             try:
                 latents = self._latents(asset_id)
+                if not (latents.standardised or self.space.mean):
+                    fault = "its latents are raw, and no mean and std of the encoder's are known"
+                    raise InputError(asset_id, fault, "latents that are standardised already")
             except (InputError, StoreError) as error:
                 self.leave_out(error)
                 continue
@@ -75,6 +78,8 @@ class LatentsReader:
 
     def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
         """Return the latents of a file with `standardised` set."""
+        if self.standardised == "auto" and not self.space.mean:
+            return replace(latents, standardised=self.space.standardised)
         if self.standardised != "auto":
             return replace(latents, standardised=self.standardised == "yes")
         moments, path = latents.moments, latents.sources[0].path

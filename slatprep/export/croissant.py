@@ -125,7 +125,11 @@ def describe(store: Store, stated: Stated | None = None, location: str = "") -> 
         **{key: value for key, value in more.items() if value},
         "keywords": ["3D", "physics", "material properties", "structured latents", "Zarr"],
         "distribution": _distribution(store, location),
-        "recordSet": [_classes(store), _properties(store), _assets(store)],
+        "recordSet": [
+            *([_classes(store)] if store.contents.classes else []),
+            _properties(store),
+            _assets(store),
+        ],
     }
 
 

@@ -25,7 +25,7 @@ from slatprep.export.formats import (
     annotated_points,
     one_by_one,
 )
-from slatprep.records import COLOURS, PROPERTY_COLUMNS, RESOLUTION
+from slatprep.records import COLOURS, MATERIAL_CLASSES, PROPERTY_COLUMNS, RESOLUTION
 from slatprep.storage.arrays import write_ply
 from slatprep.storage.files import file_name
 from slatprep.store import Store, StoredAsset
@@ -71,7 +71,8 @@ def write(
 
     `bounds` has the world bounds by asset id, for the PixieVerse frame. ``conf`` is 1 for points
     of the grid. For others it falls linearly to 0 at the largest distance that a lookup may have.
-    ``part_label`` is the class, as in Pixie's own predictions.
+    ``part_label`` is the class, as in Pixie's own predictions. A comment names classes that are not
+    PhysGaussian's.
     """
     there = annotated_points(asset, points)
     max_distance = asset.store.about.build.parameters.sample.max_distance
@@ -82,8 +83,12 @@ def write(
     name = f"{file_name(asset.asset_id)}.ply"
     columns = zip(asset.store.contents.properties, there.values.T, strict=True)
     more = {(of.name, of.unit): own for of, own in columns if of.name not in PROPERTY_COLUMNS}
-    solid, material = there.solid(asset), there.material
-    write_points(directory / name, positions, material, solid, conf, COMMENTS[frame], more)
+    solid, material, classes = there.solid(asset), there.material, asset.store.contents.classes
+    comment = COMMENTS[frame]
+    known = classes in (MATERIAL_CLASSES, ())
+    if not known:
+        comment += "; part_label " + ", ".join(f"{k} {of}" for k, of in enumerate(classes))
+    write_points(directory / name, positions, material, solid, conf, comment, more, known)
     return Exported(asset, name, len(material))
 
 
@@ -95,20 +100,26 @@ def write_points(
     conf: NDArray[np.floating],
     frame: str,
     more: Mapping[tuple[str, str], NDArray[np.float32]] | None = None,
+    known: bool = True,
 ) -> None:
-    """Write N annotated points as Pixie does, with classes 0..7 and ``conf`` in 0..1.
+    """Write N annotated points as Pixie does, with a class each and ``conf`` in 0..1.
 
     `properties` (N, 3) are Young's modulus [Pa], density [kg/m^3] and Poisson's ratio; `more` has
     further ones (N,) by name and unit. The line `frame` describes the frame in a comment.
+    ``material_id`` is -1 unless the classes are `known` to PhysGaussian.
     """
     more = more or {}
-    layout = np.dtype([*VERTEX.descr, *((name, "<f4") for name, _ in more)])
+    taken = VERTEX.names or ()
+    names = [f"property_{name}" if name in taken else name for name, _ in more]
+    layout = np.dtype([*VERTEX.descr, *((name, "<f4") for name in names)])
     modulus, density, ratio = properties.T
     alpha = np.full_like(material, 255)
     colours = *COLOURS[material].T, alpha
-    fields = *positions.T, *colours, material, density, modulus, ratio, material, conf
+    solver = material if known else np.full(len(material), -1)
+    fields = *positions.T, *colours, material, density, modulus, ratio, solver, conf
     vertices = np.rec.fromarrays([*fields, *more.values()], layout)
-    units = ", ".join((UNITS, *(f"{name} {unit}" for name, unit in more if unit)))
+    stated = zip(names, more, strict=True)
+    units = ", ".join((UNITS, *(f"{name} {unit}" for name, (_, unit) in stated if unit)))
     write_ply(path, vertices, frame, units)
 
 

@@ -266,6 +266,8 @@ def bin_materials(material: NDArray[np.uint8], solid: NDArray[np.float64], most:
     from scipy import ndimage
 
     logarithm = np.log10(solid[:, 0])
+    if not len(solid):
+        return Binned(material, logarithm, logarithm, np.zeros(0, np.intp), 0.0, 0.0)
     width = _FINEST
     while True:
         by_modulus = _cover(logarithm, np.log10(1 + width), most)

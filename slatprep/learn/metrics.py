@@ -225,11 +225,11 @@ def evaluate_store(
                 bad.append(str(error))
                 continue
             converted += prediction.converted
+            methods = [prediction, *(one.predict(rows) for one in baselines)]
             if not store.contents.classes:
-                prediction = replace(prediction, material=None)
+                methods = [replace(one, material=None) for one in methods]
             elif prediction.material is None:
                 classless.append(asset_id)
-            methods = prediction, *(one.predict(rows) for one in baselines)
             scored[index] = [score_asset(one, rows) for one in methods]
     if not scored:
         where = f"of an asset of split {split or 'all'}"

@@ -17,16 +17,9 @@ from slatprep.parameters import BuildParameters, SlatSource
 from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, source_adapter
 from slatprep.readers.files import refusing
 from slatprep.readers.plausible import ENOUGH
-from slatprep.records import (
-    PROPERTIES,
-    Contents,
-    LatentMoments,
-    LatentSpace,
-    Place,
-    Property,
-    labels_of,
-)
+from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
 from slatprep.records.encoders import LATENTS
+from slatprep.records.tables import PROPERTIES
 from slatprep.storage.documents import adapter_of, read_document
 from slatprep.storage.place import place_of
 

@@ -63,6 +63,7 @@ def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[
 
     `split_of` decides. A split that would be empty takes the object nearest to its middle in [0, 1)
     from a split that has several. This needs at least as many objects as splits.
+    It moves back once the dataset has grown and others fill the split.
     Training and test must pass the same `object_ids`: all of the dataset, before any filter.
     """
     splits = {object_id: split_of(object_id, shares) for object_id in sorted(set(object_ids))}

@@ -200,13 +200,12 @@ def _parts(
 
 
 def _known(values: NDArray[np.float32], table: Sequence[Property]) -> NDArray[np.float64]:
-    """Return `PROPERTIES` (K, 3) in SI units from values (K, P), NaN where the table lacks one."""
-    columns = {one.name: (k, one.unit) for k, one in enumerate(table)}
+    """Return the columns `PROPERTIES` (K, 3) of values (K, P), NaN where the table lacks one."""
+    columns = {one.name: k for k, one in enumerate(table)}
     own = np.full((len(values), len(PROPERTIES)), np.nan)
     for k, known in enumerate(PROPERTIES):
-        column, unit = columns.get(known.name, (-1, ""))
-        if column >= 0 and unit in ("1", *FACTORS):
-            own[:, k] = to_si(values[:, column].astype(np.float64), unit)
+        if known.name in columns:
+            own[:, k] = values[:, columns[known.name]]
     return own
 
 

@@ -52,12 +52,9 @@ def field_of_voxels(
     count, notes = len(cells), list[str]()
     once = np.asarray(voxels).dtype.kind != "f"
     if once and (roots is None or roots.plausibility != "off"):
-        way = (
-            f"say the grid's own resolution in {description}"
-            if description
-            else (f"make it anew with voxels of {resolution}^3")
-        )
-        notes += coarse_places(cells, resolution, way)
+        way = f"say the grid's own resolution in {description}"
+        anew = f"make the voxels of a grid of {resolution}^3"
+        notes += coarse_places(cells, resolution, way if description else anew)
     given = np.zeros(count, np.int64) if material is None else np.asarray(material)
     with np.errstate(invalid="ignore"):
         own = given.astype(np.int64)

@@ -54,6 +54,15 @@ class _Column:
     least: float = -np.inf
     most: float = np.inf
 
+    @property
+    def record(self) -> records.Property:
+        """The property; a known one has the usual bounds unless others are stated."""
+        bounds = self.least, self.most
+        if bounds == (-np.inf, np.inf):
+            known = (one for one in records.PROPERTIES if one.name == self.name)
+            bounds = next(((one.least, one.most) for one in known), bounds)
+        return records.Property(self.name, self.unit, self.scale == "log10", *bounds)
+
 
 @dataclass(frozen=True)
 class _Description:
@@ -69,15 +78,8 @@ class _Description:
 
     @property
     def table(self) -> tuple[records.Property, ...]:
-        """The properties, as records; known ones have the usual bounds if none are stated."""
-        table = []
-        for one in self.properties:
-            made = records.Property(one.name, one.unit, one.scale == "log10", one.least, one.most)
-            usual = [known for known in records.PROPERTIES if known.name == one.name]
-            if usual and (one.least, one.most) == (-np.inf, np.inf):
-                made = replace(made, least=usual[0].least, most=usual[0].most)
-            table.append(made)
-        return tuple(table)
+        """The properties, as records."""
+        return tuple(one.record for one in self.properties)
 
     @property
     def names(self) -> tuple[str, ...]:

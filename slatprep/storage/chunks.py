@@ -164,6 +164,7 @@ def single_threaded_blosc() -> Any:
 
 
 _DTYPES = (
+    "bool",
     *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)),
     *(f"float{bits}" for bits in (16, 32, 64)),
 )

@@ -250,6 +250,8 @@ def test_croissant_says_what_a_store_of_other_contents_holds(tmp_path):
         opened = open_store(store)
         text, card = to_json(describe(opened)), card_of(opened, Stated(), "s.zarr", [])
         assert said in text and said in card
+        sets = {one.id for one in described(opened, tmp_path).metadata.record_sets}
+        assert sets == {"properties", "assets", *(["materials"] if classes else [])}
         assert "| density | g/cm³ | log10 |" in card and "youngs_modulus" not in card
         assert not any(word in text for word in ("PixieVerse material", "Young", "PhysGaussian"))
 

@@ -187,6 +187,11 @@ def test_more_materials_are_closer_and_few_values_are_exact():
     assert len(binned.material) == 3 and binned.modulus_error < 1e-6
 
 
+def test_no_rows_have_no_materials():
+    binned = bin_materials(np.zeros(0, np.uint8), np.zeros((0, 3)), 8)
+    assert [len(part) for part in binned[:4]] == [0, 0, 0, 0] and binned[4:] == (0.0, 0.0)
+
+
 def test_a_ratio_of_one_half_is_clipped_and_said(make_dataset, tmp_path):
     dataset = make_dataset("a")
     grid = dataset.assets["a"].grid

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable, Mapping
@@ -16,6 +17,7 @@ import pytest
 import zarr
 from scipy.spatial import cKDTree
 from support.commands import document, refused, run
+from support.made_store import edit_attributes
 from support.predictions import right, write_one, write_predictions, zeros
 from support.synthetic import Dataset
 
@@ -88,16 +90,19 @@ def test_against_a_plain_computation(learn_store, predicted, form):
     assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
 
 
-def write_changed(folder: Path, store: Path, change: Callable[..., Mapping[str, Any]]) -> Path:
+def write_changed(
+    folder: Path, store: Path, change: Callable[..., Mapping[str, Any]], form: str = "npz"
+) -> Path:
     """Write the labels as predictions, changed by number of the asset, arrays and valid voxels."""
     opened = open_store(store)
     for row, asset_id in enumerate(opened.ids):
         truth = opened.read(row, ("coords", "properties", "material", "valid"))
-        write_one(folder, "npz", asset_id, change(row, right(truth), truth))
+        write_one(folder, form, asset_id, change(row, right(truth), truth))
     return folder
 
 
-def test_only_labelled_voxels_of_a_prediction_count(learn_store, tmp_path):
+@pytest.mark.parametrize("form", ["npz", "zarr", "hdf5"])
+def test_only_labelled_voxels_of_a_prediction_count(learn_store, tmp_path, form):
     def change(_: int, arrays: dict[str, Any], truth: dict[str, Any]) -> dict[str, Any]:
         count, wrong = len(truth["coords"]), ~truth["valid"]
         arrays["properties"][wrong] = np.nan
@@ -105,9 +110,21 @@ def test_only_labelled_voxels_of_a_prediction_count(learn_store, tmp_path):
         coords = np.hstack([np.zeros((count, 1), np.int32), truth["coords"]])
         return arrays | {"coords": coords, "valid": truth["valid"], "resolution": np.array(64)}
 
-    folder = write_changed(tmp_path / "p", learn_store, change)
+    folder = write_changed(tmp_path / "p.h5", learn_store, change, form)
     means = evaluate_store(folder, learn_store, None).overall.means
     assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_without_classes_nothing_has_an_accuracy(learn_store, tmp_path):
+    store = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
+    edit_attributes(store, material_classes=[])
+    material = zarr.open_group(store, mode="r+", use_consolidated=False)["voxel/material"]
+    material[:] = np.where(material[:] == 255, 255, 0)
+    folder = write_changed(tmp_path / "p", store, lambda _, arrays, truth: arrays)
+    result = evaluate_store(folder, store, None)
+    assert len(result.baselines) == 2
+    for scores in (result.overall, *result.baselines.values()):
+        assert math.isnan(scores.means["accuracy"]) and math.isfinite(scores.means["nu"])
 
 
 def test_columns_in_another_order_are_not_measured(learn_store, tmp_path):

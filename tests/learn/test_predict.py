@@ -30,7 +30,7 @@ from slatprep.learn.predictions import check_prediction
 from slatprep.learn.published import SECONDS, SECONDS_OF_OTHERS
 from slatprep.normalize import PIXIE_RANGES, normalization_of, normalize_properties
 from slatprep.particles.fields import predicted_field
-from slatprep.records import FEATS_MEAN, FEATS_STD, PIXIEVERSE, StructuredLatents
+from slatprep.records import FEATS_MEAN, FEATS_STD, PIXIEVERSE, LatentSpace, StructuredLatents
 from slatprep.records.encoders import LATENTS
 
 RANGES = np.array([[3.0, 9.0], [1.0, 4.0], [0.1, 0.5]])
@@ -326,6 +326,23 @@ def test_standardised_latents_of_a_store_and_an_encoder_of_equal_moments_are_inp
         run(path, "--checkpoint", checkpoint, "--asset", "a", "--out", tmp_path / out)
     said = (np.load(tmp_path / out / "a.npz")["properties"] for out in ("plain", "standardised"))
     np.testing.assert_allclose(*said, atol=1e-5)
+
+
+def test_latents_of_an_encoder_without_moments_are_standardised_or_refused(checkpoint, tmp_path):
+    """A build of standardised latents learns no moments, so raw ones cannot be converted."""
+    contents = replace(PIXIEVERSE, latents=LatentSpace("mine", 8, 64, standardised=True))
+    model, ranges = make_decoder("small", contents), normalization_of(RANGES, "dataset")
+    torch.save(checkpoint_state(model, "small", ranges, contents), checkpoint / "best.pt")
+    latents = random_latents(5)
+    save(tmp_path / "slats" / "a.npz", latents)
+    words = (tmp_path / "slats", "--checkpoint", checkpoint, "--out", tmp_path / "p")
+    told = run(*words)
+    assert told["predicted"] == 1
+    said = replace(latents, standardised=True)
+    (field,) = predict(load_checkpoint(checkpoint), [said])
+    np.testing.assert_allclose(np.load(tmp_path / "p" / "a.npz")["properties"], field.properties)
+    told = run(*words, "--standardised", "no", code=1)
+    assert told["predicted"] == 0 and "no mean and std of the encoder's" in told["problems"][0]
 
 
 def test_latents_of_another_encoder_are_no_input(checkpoint, tmp_path):
