@@ -79,7 +79,8 @@ class LatentsReader:
     def _of_file(self, latents: StructuredLatents) -> StructuredLatents:
         """Return the latents of a file with `standardised` set."""
         if self.standardised == "auto" and not self.space.mean:
-            return replace(latents, standardised=self.space.standardised)
+            raw = contents.tell_alone(latents.moments, self.space)
+            return replace(latents, standardised=self.space.standardised and not raw)
         if self.standardised != "auto":
             return replace(latents, standardised=self.standardised == "yes")
         moments, path = latents.moments, latents.sources[0].path

@@ -57,6 +57,10 @@ def sample(
     return Annotation(properties, material, valid, distance.astype(np.float32), place)
 
 
+TOLERANCE = 1e-5
+"""Relative tolerance of the limits of `same_within`."""
+
+
 @lru_cache(maxsize=1)
 def voxel_index_of(field: MaterialField) -> VoxelIndex:
     """Return the index of the field's annotated voxels, cached for repeated lookups."""
@@ -123,7 +127,7 @@ def same_within(
     least `least`. A small tolerance lets what a store rounds count as its source does.
     """
     limits = np.where([one.log10 for one in table], np.log10(2.0), 0.2 * np.abs(mapped))
-    return np.maximum(limits, least) * (1.0 + 1e-5)
+    return np.maximum(limits, least) * (1.0 + TOLERANCE)
 
 
 def lacking(field: MaterialField, contents: Contents) -> tuple[str, ...]:

@@ -43,7 +43,7 @@ from slatprep.align.pair import (
     Pair,
 )
 from slatprep.align.pose import Pose, Similarity
-from slatprep.align.quality import compare
+from slatprep.align.quality import compare, measure_quality
 from slatprep.align.search import ranked, search_all
 from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.align.surface import surface_of
@@ -222,8 +222,9 @@ def lead_of_another(
     """Return by how much another placement clearly beats a given one in score; NaN if none does.
 
     The given one may be off by `DISTINCT` at most, as it is polished. If it is off farther, the
-    polished one is another placement, and beats it if it halves what the score lacks of 1. Others
-    beat it by `BEATEN`; the search is skipped if none can.
+    polished one is another placement. It beats the given one if it halves what the score lacks of
+    1, and both sides lack much the same: if one side alone has more, it is not off. Others beat it
+    by `BEATEN`; the search is skipped if none can.
     """
     pair = _pair_of(field, latents, parameters)
     given = Pose(Similarity.of(transform))
@@ -232,7 +233,10 @@ def lead_of_another(
     if pair.apart([near], given)[0] < DISTINCT:
         own = near
     elif near.score > 0.5 * (1.0 + own.score):
-        return near.score - own.score
+        quality = measure_quality(field, latents, transform, parameters.radius)
+        less, more = sorted((1.0 - quality.fitness, 1.0 - quality.fitness_backward))
+        if less > 0.5 * more:
+            return near.score - own.score
     least = max(POOR, own.score + BEATEN)
     others = pair.others(given, _search(pair).poses) if least < 1.0 else []
     return max((pose.score - own.score for pose in others if pose.score > least), default=nan)

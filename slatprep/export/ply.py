@@ -84,11 +84,8 @@ def write(
     columns = zip(asset.store.contents.properties, there.values.T, strict=True)
     more = {(of.name, of.unit): own for of, own in columns if of.name not in PROPERTY_COLUMNS}
     solid, material, classes = there.solid(asset), there.material, asset.store.contents.classes
-    comment = COMMENTS[frame]
-    known = classes in (MATERIAL_CLASSES, ())
-    if not known:
-        comment += "; part_label " + ", ".join(f"{k} {of}" for k, of in enumerate(classes))
-    write_points(directory / name, positions, material, solid, conf, comment, more, known)
+    own = () if classes == MATERIAL_CLASSES else classes
+    write_points(directory / name, positions, material, solid, conf, COMMENTS[frame], more, own)
     return Exported(asset, name, len(material))
 
 
@@ -100,27 +97,31 @@ def write_points(
     conf: NDArray[np.floating],
     frame: str,
     more: Mapping[tuple[str, str], NDArray[np.float32]] | None = None,
-    known: bool = True,
+    classes: Sequence[str] = (),
 ) -> None:
     """Write N annotated points as Pixie does, with a class each and ``conf`` in 0..1.
 
     `properties` (N, 3) are Young's modulus [Pa], density [kg/m^3] and Poisson's ratio; `more` has
     further ones (N,) by name and unit. The line `frame` describes the frame in a comment.
-    ``material_id`` is -1 unless the classes are `known` to PhysGaussian.
+    Comments name `classes` that are not PhysGaussian's, and ``material_id`` is -1 for those.
     """
     more = more or {}
-    taken = VERTEX.names or ()
-    names = [f"property_{name}" if name in taken else name for name, _ in more]
+    names: list[str] = []
+    for name, _ in more:
+        while name in {*names, *(VERTEX.names or ())}:
+            name = f"property_{name}"
+        names.append(name)
     layout = np.dtype([*VERTEX.descr, *((name, "<f4") for name in names)])
     modulus, density, ratio = properties.T
     alpha = np.full_like(material, 255)
     colours = *COLOURS[material].T, alpha
-    solver = material if known else np.full(len(material), -1)
+    solver = np.full(len(material), -1) if classes else material
     fields = *positions.T, *colours, material, density, modulus, ratio, solver, conf
     vertices = np.rec.fromarrays([*fields, *more.values()], layout)
     stated = zip(names, more, strict=True)
     units = ", ".join((UNITS, *(f"{name} {unit}" for name, (_, unit) in stated if unit)))
-    write_ply(path, vertices, frame, units)
+    labels = (f"part_label {number} is {label}" for number, label in enumerate(classes))
+    write_ply(path, vertices, frame, units, *labels)
 
 
 def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tuple[str, ...]]:

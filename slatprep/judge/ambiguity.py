@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry.frames import places_of
+from slatprep.geometry.frames import Array, places_of
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.parameters import SampleParameters
 from slatprep.records import Alignment, Ambiguity, Annotation, MaterialField, StructuredLatents
@@ -70,14 +72,21 @@ def other_labels(field: MaterialField, one: Annotation, other: Annotation) -> ND
     """Return which voxels (N,) have another class, or notably other properties, in `other`.
 
     A property, compared where both are valid, must differ by more than counts as the same where
-    annotations are merged, and by more than `NOTABLE`.
+    annotations are merged. If it is not normalised in log10, it must also differ by `NOTABLE`.
     """
     differs: NDArray[np.bool_] = one.material != other.material
     # Most voxels keep their properties, so log10 is taken of the changed ones only.
-    changed = (one.properties != other.properties).any(axis=1)
+    columns = zip(one.properties.T, other.properties.T, strict=True)
+    changed = np.any([own != its for own, its in columns], axis=0)
     rows = np.flatnonzero(changed & ~differs & one.valid & other.valid)
     first, second = (to_mapped(of.properties[rows], field.table) for of in (one, other))
-    least = NOTABLE * np.ptp(property_extent(field), axis=1)
-    limits = same_within(np.maximum(np.abs(first), np.abs(second)), field.table, least)
+    limits = same_within(np.maximum(np.abs(first), np.abs(second)), field.table, notable(field))
     differs[rows] = (np.abs(first - second) > limits).any(axis=1)
     return differs
+
+
+@lru_cache(maxsize=1)
+def notable(field: MaterialField) -> Array:
+    """Return `NOTABLE` changes (P,) of a field's properties, 0 for those in log10."""
+    spans = np.ptp(property_extent(field), axis=1)
+    return np.where([one.log10 for one in field.table], 0.0, NOTABLE * spans)

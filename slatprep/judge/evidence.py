@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
-from slatprep.judge.ambiguity import NOTABLE, other_labels, thinning
+from slatprep.judge.ambiguity import NOTABLE, notable, other_labels, thinning
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import UNANNOTATED, Alignment, Annotation, MaterialField, StructuredLatents
-from slatprep.sample import voxel_index_of
+from slatprep.sample import TOLERANCE, same_within, voxel_index_of
 
 FIGURES = (
     "score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
@@ -142,11 +142,18 @@ def _labels_of(
     return every[: len(field.properties)], own
 
 
-def labels_hold(field: MaterialField, annotation: Annotation, off: NDArray[np.float64]) -> bool:
+def labels_hold(
+    field: MaterialField, annotation: Annotation, off: NDArray[np.float64], tied: bool = False
+) -> bool:
     """Return whether rounding of the properties leaves the labels of `surroundings_of` the same.
 
-    It changes each mapped property by at most `off` (P,). Classes are never rounded.
+    It changes each mapped property by at most `off` (P,). Classes are never rounded. With ties,
+    rounding may change what counts as the same if it is coarse beside the smallest limit of that.
     """
+    if tied:
+        smallest = np.abs(to_mapped(field.properties, field.table)).min(axis=0)
+        if (4.0 * off > TOLERANCE * same_within(smallest, field.table, notable(field))).any():
+            return False
     if field.classified:
         return True
     steps, size = _steps(field, annotation)

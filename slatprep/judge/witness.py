@@ -14,6 +14,7 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import combinations
 from operator import add
 
 import numpy as np
@@ -29,6 +30,7 @@ from slatprep.records import (
     RESOLUTION,
     UNANNOTATED,
     Alignment,
+    Annotation,
     LatentChoice,
     MaterialField,
     StructuredLatents,
@@ -222,17 +224,18 @@ def weigh(
     `material` (N,) are its labels, 255 for none. The model must come from other objects.
     """
     likely = model.log_likelihood(latents.feats)
-    labels, differing = material[None], np.zeros((1, 1), dtype=np.int64)
+    labels, found = material[None], list[Annotation]()
     if alignment.placements:
         # The other placements have no deformation, so the best one is compared without it.
         tied = (alignment.transform, *(p.transform for p in alignment.placements))
         places = (places_of(latents.centres, transform) for transform in tied)
         found = [sample(field, place, parameters) for place in places]
         labels = np.stack([one.material for one in found])
-        some = (labels != UNANNOTATED).all(axis=0)
-        others = [[other_labels(field, one, two)[some].sum() for two in found] for one in found]
-        differing = np.array(others)
+    differing = np.zeros((len(labels),) * 2, dtype=np.int64)
     rows = np.flatnonzero((labels != UNANNOTATED).all(axis=0))
+    for i, j in combinations(range(len(labels)), 2):
+        count = np.count_nonzero(other_labels(field, found[i], found[j])[rows])
+        differing[i, j] = differing[j, i] = count
     support = np.array([likely[rows, one[rows]].sum() for one in labels])
     return LatentEvidence(
         support,

@@ -177,7 +177,8 @@ def checked_latents(
     if len(coords) >= ENOUGH and space.mean:
         usual = np.ones(space.channels) if space.standardised else np.array(space.std)
         spread = float(np.median(np.array(latents.moments.std) / usual))
-        if spread > 0.0 and not _SPREADS[0] <= spread <= _SPREADS[1]:
+        alike = _SPREADS[0] <= spread <= _SPREADS[1] or look_standardised(latents.moments, space)
+        if spread > 0.0 and not alike:
             what = f"feats spread {spread:.2g} times as far as those of {space.encoder} do"
             warnings.append(oddity("latents", f"{what}: were they standardised or scaled twice?"))
     return replace(latents, warnings=tuple(warnings))

@@ -44,14 +44,15 @@ def field_of_voxels(
     voxels' most frequent class (the lowest at a tie) and the mean properties of that class's
     voxels. The mean is in log10 for properties that are normalised in log10. InputError if there is
     no voxel, one is out of range, or too many are unphysical. `names` are the classes' names;
-    `roots` state the units of the values and how implausible ones are treated. An integer voxel may
-    not occur twice with different values. Integer voxels that fill only an eighth of the grid give
-    a warning, which names the file `description` if one states the resolution.
+    `roots` state the units of the values and how implausible ones are treated. If a file
+    `description` states the resolution, an integer voxel may not occur twice with different values.
+    Integer voxels that fill only an eighth of the grid give a warning.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
-    once = np.asarray(voxels).dtype.kind != "f"
-    if once and (roots is None or roots.plausibility != "off"):
+    whole = np.asarray(voxels).dtype.kind != "f"
+    once = whole and bool(description)
+    if whole and (roots is None or roots.plausibility != "off"):
         way = f"say the grid's own resolution in {description}"
         anew = f"make the voxels of a grid of {resolution}^3"
         notes += coarse_places(cells, resolution, way if description else anew)

@@ -57,11 +57,11 @@ class _Column:
     @property
     def record(self) -> records.Property:
         """The property; a known one has the usual bounds unless others are stated."""
-        bounds = self.least, self.most
-        if bounds == (-np.inf, np.inf):
-            known = (one for one in records.PROPERTIES if one.name == self.name)
-            bounds = next(((one.least, one.most) for one in known), bounds)
-        return records.Property(self.name, self.unit, self.scale == "log10", *bounds)
+        least, most = self.least, self.most
+        for usual in (one for one in records.PROPERTIES if one.name == self.name):
+            least = usual.least if least == -np.inf else least
+            most = usual.most if most == np.inf else most
+        return records.Property(self.name, self.unit, self.scale == "log10", least, most)
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ class LatentChoice:
         Log-likelihood ratio of the latents between its labels and the next placement's. Voxels
         are treated as independent.
     voxels : int
-        Number of voxels to which these two placements give different classes.
+        Number of voxels to which these two placements give different labels.
     witnesses, agreeing : int
         Number of other assets that tested the latents, and of those among them whose latents
         preferred their own labels to wrong ones.

@@ -363,6 +363,17 @@ def test_a_stated_frame_that_slides_along_a_rod_is_beaten_by_the_one_that_does_n
     assert good is (slid == 1)
 
 
+@pytest.mark.parametrize("cut", [3, 5])
+def test_a_right_frame_of_a_rod_that_one_side_has_shorter_is_not_beaten(cut):
+    rod = np.zeros((64,) * 3, dtype=bool)
+    rod[2:62, 30:34, 30:34] = True
+    field = replace(field_of(rod), frame=np.eye(4))
+    shorter = surface_latents(rod & (GRID[..., 0] >= 2 + cut))
+    alignment = align(field, shorter, AlignParameters(engine="known"))
+    assert np.isnan(alignment.margin)
+    assert judged(field, shorter, alignment).verdict is Verdict.GOOD
+
+
 def test_a_stated_frame_is_held_against_the_placement_that_fits_best():
     # A block and its half-turn differ by a knob alone.
     occupancy = np.zeros((64,) * 3, dtype=bool)

@@ -170,6 +170,19 @@ def test_ties_that_change_few_classes_count_as_one():
     assert not surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied.any()
 
 
+def test_rounding_beside_what_counts_as_the_same_decides_whether_labels_of_ties_hold():
+    """The limit of log10 is 0.3, and 1e-5 of it may be rounded; that of a ratio of 0.3 is 0.06."""
+    field, _, annotation = column(2)
+    field = replace(field, properties=np.full_like(field.properties, 0.3))
+    for off, holds in (
+        ([7e-7, 7e-7, 1.4e-7], True),
+        ([0, 0, 1.6e-7], False),
+        ([8e-7, 0, 0], False),
+    ):
+        assert labels_hold(field, annotation, np.array(off), tied=True) is holds
+        assert labels_hold(field, annotation, np.array(off))
+
+
 def plain_field(values: np.ndarray) -> records.MaterialField:
     """Return a field without classes, of voxels (K, P) of properties that are not mapped."""
     voxels = np.argwhere(np.ones((64, 64, 64), dtype=bool))[: len(values)].astype(np.uint8)

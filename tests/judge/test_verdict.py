@@ -321,6 +321,7 @@ def test_other_labels_by_hand():
         (1, 1e10, 0.05, 1, 1e10, 0.26, True),
         (1, 1e10, 1.0, 1, 1e10, 0.81, False),
         (1, 1e10, 1.0, 1, 1e10, 0.79, True),
+        (1, 1e3, 0.0, 1, 2.1e3, 0.0, True),
         (1, 1e10, 0.0, 2, 1e10, 0.0, True),
         (1, 1e10, 0.0, 255, np.nan, np.nan, True),
         (255, np.nan, np.nan, 255, np.nan, np.nan, False),

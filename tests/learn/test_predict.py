@@ -333,7 +333,9 @@ def test_latents_of_an_encoder_without_moments_are_standardised_or_refused(check
     contents = replace(PIXIEVERSE, latents=LatentSpace("mine", 8, 64, standardised=True))
     model, ranges = make_decoder("small", contents), normalization_of(RANGES, "dataset")
     torch.save(checkpoint_state(model, "small", ranges, contents), checkpoint / "best.pt")
-    latents = random_latents(5)
+    rng = np.random.default_rng(5)
+    feats = rng.normal(0.7, 0.9, (300, 8)).astype(np.float32)
+    latents = replace(random_latents(5), feats=feats)
     save(tmp_path / "slats" / "a.npz", latents)
     words = (tmp_path / "slats", "--checkpoint", checkpoint, "--out", tmp_path / "p")
     told = run(*words)
@@ -341,8 +343,11 @@ def test_latents_of_an_encoder_without_moments_are_standardised_or_refused(check
     said = replace(latents, standardised=True)
     (field,) = predict(load_checkpoint(checkpoint), [said])
     np.testing.assert_allclose(np.load(tmp_path / "p" / "a.npz")["properties"], field.properties)
-    told = run(*words, "--standardised", "no", code=1)
-    assert told["predicted"] == 0 and "no mean and std of the encoder's" in told["problems"][0]
+    raw = tmp_path / "raw"
+    save(raw / "a.npz", replace(latents, feats=3 * feats))
+    for given in ((*words, "--standardised", "no"), (raw, *words[1:])):
+        told = run(*given, code=1)
+        assert told["predicted"] == 0 and "no mean and std of the encoder's" in told["problems"][0]
 
 
 def test_latents_of_another_encoder_are_no_input(checkpoint, tmp_path):

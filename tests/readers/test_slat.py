@@ -14,6 +14,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import SlatSource
 from slatprep.readers import read_latents, read_slat
 from slatprep.readers.contents import latent_space, look_standardised, tell_alone
+from slatprep.readers.slat import checked_latents
 from slatprep.readers.slat_files import slat_patterns
 from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentMoments, LatentSpace, SourceFile
 from slatprep.records.encoders import LATENTS
@@ -190,6 +191,16 @@ def test_latents_that_were_scaled_twice_are_told(change, said, make_pair):
     read = read_latents(make_pair(**whole | {"feats": feats}))
     told = [text for text in read.warnings if "unusual latents" in text]
     assert len(told) == bool(said) and said in "".join(told)
+
+
+@pytest.mark.parametrize("name", LATENTS)
+def test_latents_of_known_encoders_are_usual_raw_and_standardised(name):
+    space = LATENTS[name]
+    rng, whole = np.random.default_rng(1), cloud(space.resolution, 2000)
+    scaled = rng.normal(0, 0.8, (2000, space.channels))
+    for feats in (scaled, scaled * np.array(space.std) + np.array(space.mean)):
+        read = checked_latents(whole["coords"], feats.astype(np.float32), "any", space=space)
+        assert not [text for text in read.warnings if "unusual" in text]
 
 
 def test_missing_array_and_group(make_pair):

@@ -146,17 +146,19 @@ def test_a_resolution_that_is_not_the_voxels_own_is_told(root):
     assert "as on a grid of 64^3, and 128^3 is read" in told and "source.json" in told
 
 
-def test_voxels_of_vomp_on_every_second_cell_or_with_two_values_are_told(tmp_path):
+def test_voxels_of_vomp_on_every_second_cell_or_not_finite_are_told(tmp_path):
     rows = {name: column[:500] for name, column in rows_of(500, 32).items()}
     coarse = rows | {"voxels": 2 * rows["voxels"]}
     write_vomp(tmp_path / "coarse", coarse)
     (told,) = field_at(tmp_path / "coarse", "vomp").warnings
     assert "all coordinates are even, or all are odd, as on a grid of 32^3" in told
+    # Its toolkit fills parts one by one, so that a cell where two touch occurs twice.
     twice = {name: np.concatenate([column, column[:1]]) for name, column in rows.items()}
     twice["density"][-1] = 9000.0
     write_vomp(tmp_path / "twice", twice)
-    with pytest.raises(InputError, match="rows 0 and 500 are of one voxel, and differ"):
-        field_at(tmp_path / "twice", "vomp")
+    assert (
+        "501 voxels were merged into 500 of 64^3" in field_at(tmp_path / "twice", "vomp").warnings
+    )
     data = np.load(tmp_path / "coarse" / "a_with_materials.npz")["voxel_data"]
     data["y"][3] = np.nan
     np.savez(tmp_path / "coarse" / "a_with_materials.npz", voxel_data=data)
@@ -170,6 +172,9 @@ def test_poissons_ratio_of_any_source_has_the_bounds_of_a_material_unless_others
     rows["poissons_ratio"] = np.where(np.arange(300) < 100, 0.9, 0.3).astype(np.float32)
     sources.write_voxels(root, "a", "npz", rows)
     sources.write_description(root, (*TABLE, ratio), CLASSES)
+    with pytest.raises(InputError, match="100 of 300 annotated voxels are unphysical"):
+        field_at(root)
+    sources.write_description(root, (*TABLE, ratio | {"least": -1}), CLASSES)
     with pytest.raises(InputError, match="100 of 300 annotated voxels are unphysical"):
         field_at(root)
     sources.write_description(root, (*TABLE, ratio | {"least": -1, "most": 1}), CLASSES)

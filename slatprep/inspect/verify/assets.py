@@ -174,12 +174,13 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
         return
     field, properties = asset.normalised_field, asset.properties
     # The confidence comes from classes alone, if there are any and nothing ties.
-    if not field.classified or record.alignment.open_placements:
+    tied = bool(record.alignment.open_placements)
+    if tied or not field.classified:
         if asset.store.cached_column("clipped_grid")[asset.index].any():
             return  # The confidence came from values that the store does not hold.
         field, properties = asset.field, asset.properties_si
     annotation = Annotation(properties, asset.material, asset.valid, asset.distance, asset.place)
-    if not labels_hold(field, annotation, roundings(asset.store.normalization)):
+    if not labels_hold(field, annotation, roundings(asset.store.normalization), tied):
         return  # The confidence may come from other labels than the rounded values give.
     confidence = record.judgement.confidence
     likely = voxel_confidence(field, asset.latents, record.alignment, annotation, confidence)
