@@ -44,7 +44,7 @@ from slatprep.align.pair import (
 )
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.quality import compare, measure_quality
-from slatprep.align.search import ranked, search_all
+from slatprep.align.search import ranked, repeated, search_all
 from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.align.surface import surface_of
 from slatprep.align.warp import Warp
@@ -124,12 +124,15 @@ def _search(pair: Pair) -> Candidates:
     starts = pair.starts((s.rotation for s in distinct_starts()), pair.size_ratio)
     fits = pair.refine(starts, COARSE_SAMPLES, COARSE_TAUS, 0.02)
     poses = pair.polish(fits)
-    if not _is_poor(poses):
-        return Candidates(poses, fits, [], [])
-    refined, halfway = search_all(pair)
-    wide = pair.polish(refined)
-    if wide[0].score > poses[0].score + WIDER_GAIN:
-        poses = pair.distinct([*poses, *wide])
+    wide: list[Pose] = []
+    halfway: list[Pose] = []
+    if _is_poor(poses):
+        refined, halfway = search_all(pair)
+        wide = pair.polish(refined)
+        if wide[0].score > poses[0].score + WIDER_GAIN:
+            poses = pair.distinct([*poses, *wide])
+    if poses[0].score >= POOR:
+        poses = pair.distinct([*poses, *repeated(pair, poses[0])])
     return Candidates(poses, fits, wide, halfway)
 
 

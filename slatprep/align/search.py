@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -34,6 +35,13 @@ SO3_STARTS, SO3_HALFWAY, SO3_KEPT = 240, 4, 80
 
 The best placement was among the first 30 then for 177 of 180 assets; the others have many ties.
 """
+
+TURN, SLIDE, MOST_SLID, REACH = 12, 3.0, 20.0, 0.4
+"""Steps of the moves of `repeated`, in degrees and voxels; the farthest slides, in voxels and as a
+share of the extent."""
+
+REPEATED_SAMPLES, REPEATED_KEPT = 40, 24
+"""Samples for the first steps of such poses, and the number of poses that are refined further."""
 
 SAME_SIZE = 0.05
 """Largest difference of the size ratio from one without a second set of starts at scale one."""
@@ -85,6 +93,34 @@ def search_all(pair: Pair) -> tuple[list[Pose], list[Pose]]:
     kept = [pose for some in sets for pose in some[: SO3_KEPT // len(sets)]]
     refined = pair.refine(kept, COARSE_SAMPLES, COARSE_TAUS[SO3_HALFWAY:], 0.02)
     return refined, sets[0]
+
+
+def repeated(pair: Pair, best: Pose) -> list[Pose]:
+    """Refine a pose turned about, and slid along, the principal axes of the SLAT's surface.
+
+    What repeats itself, such as stairs, a comb or a gear, fits after such a move nearly as well.
+    Starts that lay the centroids on each other may then miss the right placement.
+    """
+    axes, centre = pair.principal[0].T, pair.slat.centroid
+    half = [2.0 * np.outer(axis, axis) - np.eye(3) for axis in axes]
+    angles = np.radians(np.arange(0, 360, TURN))[:, None, None]
+    moves = []
+    for axis, across in zip(axes, np.roll(half, -1, axis=0), strict=True):
+        along = np.outer(axis, axis)
+        turns = along + np.cos(angles) * (np.eye(3) - along)
+        turns = turns + np.sin(angles) * np.cross(np.eye(3), axis)
+        moves += [(turn, 0.0 * axis) for turn in [*turns[1:], *(turns @ across)]]
+        most = min(MOST_SLID, REACH * float(np.ptp(pair.slat.points @ axis)))
+        slides = np.arange(SLIDE, most, SLIDE)
+        moves += product([np.eye(3), *half], np.concatenate([slides, -slides])[:, None] * axis)
+    own, away = best.similarity, best.similarity.shift - centre
+    starts = [
+        Pose(own._replace(rotation=turn @ own.rotation, shift=turn @ away + centre + by))
+        for turn, by in moves
+    ]
+    halfway = pair.refine(starts, REPEATED_SAMPLES, (3.0, 2.0), 0.02)
+    kept = sorted(halfway, key=lambda pose: -pose.score)[:REPEATED_KEPT]
+    return pair.polish(pair.refine(kept, COARSE_SAMPLES, (2.0, 1.0), 0.02))
 
 
 def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from support.demos import made_cases
 from support.faults import environment
 from support.shapes import GRID, chair, field_of, judged, latents_of, surface_latents, turned
@@ -32,6 +33,7 @@ from slatprep.geometry.frames import (
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.inspect.score import compare_with_truth
 from slatprep.parameters import PRESETS, AlignParameters, SampleParameters
+from slatprep.pipeline.annotate import look_up
 from slatprep.records import Engine, Verdict
 from slatprep.sample import sample
 
@@ -334,6 +336,57 @@ def test_an_engine_whose_libraries_are_missing_names_them(library, package, monk
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SlatprepError, match=rf"{library}.* {package}"):
         engine_versions(ENGINES["open3d"])
+
+
+def _stairs(steps: int) -> np.ndarray:
+    """Return the classes of the first of seven steps, each of its own."""
+    classes = np.zeros((64,) * 3, dtype=np.uint8)
+    for k in range(steps):
+        classes[4 + 8 * k : 14 + 8 * k, 23:41, 5 + 7 * k : 12 + 7 * k] = 1 + k % 6
+    return classes
+
+
+def _gear(teeth: int) -> np.ndarray:
+    """Return the classes of the sectors of a gear with a key at one of its teeth."""
+    x, y, z = np.moveaxis(GRID - 31.5, -1, 0)
+    turn, radius = np.arctan2(y, x) % (2 * np.pi) * teeth / (2 * np.pi) + 0.5, np.hypot(x, y)
+    tooth, within = turn.astype(int) % teeth, np.abs(turn % 1.0 - 0.5) < 0.25
+    solid = (radius < np.where(within, 26, 20)) & (np.abs(z) < 5)
+    solid &= ~((tooth == 0) & (radius > 14) & within)
+    return np.where(solid, 1 + tooth % 6, 0).astype(np.uint8)
+
+
+def _comb(teeth: int) -> np.ndarray:
+    """Return the classes of the first of seven teeth, each of its own."""
+    classes = np.zeros((64,) * 3, dtype=np.uint8)
+    for k in range(teeth):
+        classes[4 + 8 * k : 12 + 8 * k, 22:30, 28:36] = 1 + k % 6
+        classes[4 + 8 * k : 8 + 8 * k, 30:44, 28:36] = 1 + k % 6
+    return classes
+
+
+def _turn(degrees: float, *axis: float) -> np.ndarray:
+    return Rotation.from_rotvec(
+        np.radians(degrees) * np.array(axis) / np.linalg.norm(axis)
+    ).as_matrix()
+
+
+@pytest.mark.parametrize(("whole", "other", "turn"), [
+    (_comb(7), _comb(6), np.eye(3)),
+    (_comb(6), _comb(7), distinct_starts()[1].rotation),
+    (_stairs(7), _stairs(6), _turn(13, 1, 2, 3)),
+    (_gear(12), _gear(12), _turn(47, 2, -1, 0.5)),
+], ids=["tooth less", "tooth more", "step less", "gear"])  # fmt: skip
+def test_what_repeats_itself_is_placed_right_or_is_not_good(whole, other, turn):
+    """Slid by a step or turned by a tooth it fits nearly as well, and all labels are wrong."""
+    back = ((GRID - 31.5) @ turn + 31.5).round().astype(int)
+    inside = ((back >= 0) & (back < 64)).all(axis=-1)
+    there = np.where(inside, other[tuple(np.moveaxis(back.clip(0, 63), -1, 0))], 0)
+    field, latents = field_of(whole > 0, whole), surface_latents(there > 0)
+    alignment = align(field, latents, AlignParameters())
+    annotation, judgement = look_up(field, latents, alignment, SampleParameters())
+    right = annotation.material == there[tuple(latents.coords.T.astype(int))]
+    assert right[annotation.valid].mean() > 0.9 or judgement.verdict is not Verdict.GOOD
 
 
 @pytest.mark.parametrize(("engine", "extra"), [("open3d", "paper"), ("small_gicp", "bench")])

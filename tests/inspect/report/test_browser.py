@@ -439,7 +439,7 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Report:
     root = tmp_path_factory.mktemp("texts") / IN_NAMES
     dataset = Dataset(root)
     (root / "voxels").mkdir(parents=True)
-    units = {"density": HOSTILE, "friction": f"{HOSTILE}\u2028\n", "heat": "\\u003cscript>"}
+    units = {"damping": HOSTILE, "friction": f"{HOSTILE}\u2028\n", "heat": "\\u003cscript>"}
     for number, name in enumerate((*SOUND, *REFUSED, "torn")):
         dataset.add(name, number)
         asset = dataset.assets[name]
