@@ -33,11 +33,14 @@ LEAST_WINNERS = 5
 LEAST_SHARE = 0.5
 """Smallest number, and smallest share, of the clear winners that have a common rotation."""
 
-TEMPERATURE = 0.02
-"""Rise of the score, after deformation, that makes a placement e times as likely."""
+TEMPERATURE, SHARPER = 0.02, 0.2
+"""Rise of the score, after deformation, that makes a placement e times as likely, and what the
+score lacks of 1 below which a smaller rise does: the better the fit, the more a rise says."""
 
 SURE = 0.95
 """Smallest probability at which an asset without a tie takes the common rotation."""
+
+_QUARTERS = 24
 
 NEAR_DEGREES = 30.0
 """Largest angle, in degrees, between two rotations that count as the same quarter turn."""
@@ -53,37 +56,37 @@ def find_consensus(transforms: ArrayLike) -> Consensus | None:
     rotations = linear / np.cbrt(np.linalg.det(linear))[:, None, None]
     if not len(rotations):
         return None
-    quarters = [start.rotation for start in distinct_starts()]
-    angles = np.stack([degrees_between(rotations, quarter) for quarter in quarters], axis=1)
-    nearest = np.where(angles.min(axis=1) <= NEAR_DEGREES, angles.argmin(axis=1), len(quarters))
+    nearest = _quarter_of(rotations)
     # The lowest index wins a draw, so that the order of assets does not matter.
-    common = np.bincount(nearest, minlength=len(quarters))[: len(quarters)].argmax()
+    counts = np.bincount(nearest, minlength=_QUARTERS + 1)[:_QUARTERS]
+    common = int(counts.argmax())
     members = rotations[nearest == common]
     if len(members) < LEAST_WINNERS or len(members) < LEAST_SHARE * len(rotations):
         return None
-    return Consensus(
-        rotation=_mean_rotation(members), winners=len(rotations), agreeing=len(members)
-    )
+    others = tuple(np.where(np.arange(_QUARTERS) == common, 0, counts).tolist())
+    return Consensus(_mean_rotation(members), len(rotations), len(members), others)
 
 
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
     """Choose, among tied placements, the one nearest to the common rotation.
 
-    Return the same object if nothing is tied or no tied placement has the common rotation.
+    Return the same object if nothing is tied, no tied placement has the common rotation, or another
+    one is likelier.
     """
     if not alignment.placements:
         return alignment
     ties = [Placement(alignment.transform, alignment.score, 0.0), *alignment.placements]
-    angles = [degrees_between(split_transform(t.transform)[0], consensus.rotation) for t in ties]
+    rotations = np.array([split_transform(tie.transform)[0] for tie in ties])
+    angles = degrees_between(rotations, consensus.rotation)
     chosen = int(np.argmin(angles))
     if angles[chosen] > NEAR_DEGREES:
         return alignment
-    prior, rare = _shares_of(consensus)
-    odds = [prior if angle <= NEAR_DEGREES else rare for angle in angles]
-    scores = np.array([tie.score for tie in ties])
+    odds, scores = _odds_of(consensus, rotations), np.array([tie.score for tie in ties])
     # The score is NaN for an engine that ranks by fitness alone.
-    likely = odds * np.exp(np.nan_to_num(scores - scores[chosen]) / TEMPERATURE)
-    by = replace(consensus, probability=float(odds[chosen] / likely.sum()))
+    rise = np.nan_to_num((scores - scores[chosen]) / temperature_of(alignment.score))
+    by = replace(consensus, probability=float(odds[chosen] / (odds * np.exp(rise)).sum()))
+    if by.probability < 0.5:
+        return alignment
     if chosen == 0:
         return replace(alignment, settled_by=by)
     return take(alignment, chosen - 1, latents, by)
@@ -111,7 +114,7 @@ def turn_if_likelier(
     placement, gain = fitted_near(alignment, consensus.rotation, field, latents, parameters)
     if not is_common(placement.transform, consensus):
         return alignment
-    probability = probability_of_common(consensus, gain)
+    probability = probability_of_common(consensus, gain, alignment)
     if probability < SURE:
         return alignment
     left = replace(alignment, placements=(placement, *alignment.placements))
@@ -123,20 +126,39 @@ def is_common(transform: ArrayLike, consensus: Consensus) -> bool:
     return bool(degrees_between(split_transform(transform)[0], consensus.rotation) <= NEAR_DEGREES)
 
 
-def probability_of_common(consensus: Consensus, gain: float) -> float:
-    """Return the probability of the common rotation against one other quarter turn.
+def probability_of_common(consensus: Consensus, gain: float, alignment: Alignment) -> float:
+    """Return the probability of the common rotation against that of an alignment.
 
     `gain` is the rise of the asset's score in the common rotation, after deformation.
     """
-    common, other = _shares_of(consensus)
-    return 1.0 / (1.0 + other / common * math.exp(min(-gain / TEMPERATURE, 700.0)))
+    present = split_transform(alignment.transform)[0]
+    common, other = _odds_of(consensus, np.array([consensus.rotation, present]))
+    rise = min(-gain / temperature_of(alignment.score), 700.0)
+    return float(1.0 / (1.0 + other / common * math.exp(rise)))
 
 
-def _shares_of(consensus: Consensus) -> tuple[float, float]:
-    """Return the frequency in the dataset of the common and of each other quarter turn."""
+def temperature_of(score: float) -> float:
+    """Return the rise of a score that makes a placement e times as likely; NaN counts as poor."""
+    lacks = 1.0 if math.isnan(score) else (1.0 - score) / SHARPER
+    return TEMPERATURE * min(max(lacks, 0.1), 1.0)
+
+
+def _odds_of(consensus: Consensus, rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the frequencies in the dataset of the quarter turns of rotations (K, 3, 3)."""
     # One more asset is counted as disagreeing, so that no rotation has probability 0.
-    common = consensus.agreeing / (consensus.winners + 1)
-    return common, (1.0 - common) / (len(distinct_starts()) - 1)
+    left = consensus.winners + 1 - consensus.agreeing - sum(consensus.others)
+    counts = np.array([*consensus.others, 0]) + left / (_QUARTERS - 1)
+    common = degrees_between(rotations, consensus.rotation) <= NEAR_DEGREES
+    odds = np.where(common, consensus.agreeing, counts[_quarter_of(rotations)])
+    return np.asarray(odds / (consensus.winners + 1))
+
+
+def _quarter_of(rotations: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the number of the quarter turn near each rotation (K, 3, 3), `_QUARTERS` if none."""
+    quarters = [start.rotation for start in distinct_starts()]
+    angles = np.stack([degrees_between(rotations, quarter) for quarter in quarters], axis=1)
+    near = angles.min(axis=1) <= NEAR_DEGREES
+    return np.where(near, angles.argmin(axis=1), _QUARTERS)
 
 
 def degrees_between(rotation: ArrayLike, other: ArrayLike) -> Any:

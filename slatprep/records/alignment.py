@@ -118,12 +118,14 @@ class Judgement:
 class Consensus:
     """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common.
 
+    `others` counts those at each quarter turn but that, in the order of `distinct_starts`.
     `probability` is the probability that it is right for the asset that takes it by consensus.
     """
 
     rotation: Rotation
     winners: Annotated[int, Ge(1)]
     agreeing: Annotated[int, Ge(1)]
+    others: Annotated[tuple[Count, ...], MinLen(24), MaxLen(24)] = (0,) * 24
     probability: Number = float("nan")
 
 

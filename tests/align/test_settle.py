@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.deformed import MOVES, occupancy
-from support.shapes import chair, field_of, surface_latents, turned
+from support.shapes import aligned, chair, field_of, latents_of, surface_latents, turned
 
 from slatprep import records
 from slatprep.align import align
@@ -80,9 +80,11 @@ def test_no_turn_and_half_a_turn_are_angles_too():
         assert degrees_between(turn, back) == pytest.approx(180.0, abs=1e-5)
 
 
+AWAY = [s.rotation for s in distinct_starts() if degrees_between(s.rotation, COMMON) > 1]
+
+
 def _agreeing(count: int, others: int = 0) -> records.Consensus:
-    away = [s.rotation for s in distinct_starts() if degrees_between(s.rotation, COMMON) > 1]
-    return find_consensus([make_transform(turn) for turn in [COMMON] * count + away[:others]])
+    return find_consensus([make_transform(turn) for turn in [COMMON] * count + AWAY[:others]])
 
 
 @pytest.fixture(scope="module")
@@ -127,15 +129,40 @@ def test_whichever_placement_came_first_the_same_one_is_chosen(boxed):
 
 
 @pytest.mark.parametrize("gain", [-0.1, -0.02, 0.0, 0.03])
+@pytest.mark.parametrize(("score", "sharper"), [(0.3, 1), (0.9, 2), (0.999, 10), (np.nan, 1)])
 @pytest.mark.parametrize(("agree", "others"), [(5, 5), (19, 1), (400, 0)])
-def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(agree, others, gain):
-    """By Bayes' rule, counted over a dataset of the common rotation and of 23 other ones."""
-    seen = agree + others + 1
-    prior = np.array([agree / seen] + [(others + 1) / seen / 23] * 23)
-    likelihood = np.exp(np.array([gain, 0.0]) / TEMPERATURE)
-    joint = prior[:2] * likelihood
-    expected = joint[0] / joint.sum()
-    assert probability_of_common(_agreeing(agree, others), gain) == pytest.approx(expected)
+def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
+    agree, others, score, sharper, gain
+):
+    """By Bayes' rule: one more asset has any of the 23 other rotations, beside those counted."""
+    consensus = _agreeing(agree, others)
+    for number in (0, 22):
+        present = aligned(make_transform(AWAY[number]), score=score)
+        prior = np.array([agree, (number < others) + 1 / 23])
+        joint = prior * np.exp(np.array([gain, 0.0]) / TEMPERATURE * sharper)
+        expected = joint[0] / joint.sum()
+        assert probability_of_common(consensus, gain, present) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("agree", "opposite", "taken"), [(6, 4, 0.6), (5, 5, 0), (40, 0, 1), (40, 2, 0.95)]
+)
+def test_ties_of_a_dataset_of_two_frames_are_no_surer_than_its_counts(agree, opposite, taken):
+    """Half a turn apart, both of a tie's placements are frames of the dataset."""
+    half = np.diag([-1.0, -1.0, 1.0]) @ COMMON
+    turns = [COMMON] * agree + [half] * opposite
+    consensus = find_consensus([make_transform(turn) for turn in turns])
+    tied = aligned(make_transform(COMMON), make_transform(half), score=1.0)
+    by = settle(tied, latents_of([[1, 2, 3]]), consensus).settled_by
+    assert (0 if by is None else by.probability) == pytest.approx(taken, abs=0.01)
+
+
+def test_a_tie_that_fits_clearly_better_otherwise_stays_open():
+    half = np.diag([-1.0, -1.0, 1.0]) @ COMMON
+    tied = aligned(make_transform(half), make_transform(COMMON), score=0.99)
+    worse = replace(tied.placements[0], score=0.97)
+    tied = replace(tied, placements=(worse,))
+    assert settle(tied, latents_of([[1, 2, 3]]), _agreeing(40)) is tied
 
 
 @pytest.mark.parametrize(
