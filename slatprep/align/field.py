@@ -80,8 +80,10 @@ CLEARLY = 2.5
 scores. A placement that fits better ties whatever its score, if this was measured."""
 
 
-BEATEN = 2 * TIE
-"""Lead in score at which another placement contradicts a stated frame."""
+BEATEN, BETTER, FINE = 2 * TIE, 0.25, 0.99
+"""Leads at which another placement contradicts a stated frame: in score, and as a share of what the
+score lacks of 1. True frames of real meshes are led by at most 0.11 of it. `FINE` is the score from
+which a stated frame is right."""
 
 
 class Candidates(NamedTuple):
@@ -225,23 +227,23 @@ def lead_of_another(
     """Return by how much another placement clearly beats a given one in score; NaN if none does.
 
     The given one may be off by `DISTINCT` at most, as it is polished. If it is off farther, the
-    polished one is another placement. It beats the given one if it halves what the score lacks of
-    1, and both sides lack much the same: if one side alone has more, it is not off. Others beat it
-    by `BEATEN`; the search is skipped if none can.
+    polished one is another placement, and beats it if it halves what the score lacks of 1. Others
+    beat it by `BEATEN`, or by `BETTER`; from the score `FINE` on none is searched for. If one side
+    alone has more than the other, it is not off, and only `BEATEN` counts.
     """
     pair = _pair_of(field, latents, parameters)
     given = Pose(Similarity.of(transform))
     (own,) = pair.refine([given], POLISH_SAMPLES, (), 0.0)
     (near,) = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
+    quality = measure_quality(field, latents, transform, parameters.radius)
+    less, more = sorted((1.0 - quality.fitness, 1.0 - quality.fitness_backward))
+    better = BETTER if less > 0.5 * more else 1.0
     if pair.apart([near], given)[0] < DISTINCT:
         own = near
-    elif near.score > 0.5 * (1.0 + own.score):
-        quality = measure_quality(field, latents, transform, parameters.radius)
-        less, more = sorted((1.0 - quality.fitness, 1.0 - quality.fitness_backward))
-        if less > 0.5 * more:
-            return near.score - own.score
-    least = max(POOR, own.score + BEATEN)
-    others = pair.others(given, _search(pair).poses) if least < 1.0 else []
+    elif better < 1.0 and near.score > 0.5 * (1.0 + own.score):
+        return near.score - own.score
+    least = max(POOR, own.score + min(BEATEN, better * (1.0 - own.score)))
+    others = pair.others(given, _search(pair).poses) if own.score < FINE else []
     return max((pose.score - own.score for pose in others if pose.score > least), default=nan)
 
 

@@ -416,6 +416,20 @@ def test_a_stated_frame_that_slides_along_a_rod_is_beaten_by_the_one_that_does_n
     assert good is (slid == 1)
 
 
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_a_stated_frame_turned_by_half_is_beaten_though_only_a_post_tells(turn):
+    sheet = np.zeros((64,) * 3, dtype=bool)
+    sheet[4:60, 14:50, 30:33] = sheet[4:8, 14:18, 33:45] = True
+    latents = surface_latents(sheet)
+    signs = -np.ones(3)
+    signs[turn - 1] = 1.0
+    for frame, right in ((np.eye(4), True), (make_transform(np.diag(signs)), False)):
+        field = replace(field_of(sheet, np.where(GRID[..., 0] < 32, 1, 2)), frame=frame)
+        alignment = align(field, latents, AlignParameters(engine="known"))
+        assert np.isnan(alignment.margin) if right else alignment.margin < 0.0
+        assert (judged(field, latents, alignment).verdict is Verdict.GOOD) is right
+
+
 @pytest.mark.parametrize("cut", [3, 5])
 def test_a_right_frame_of_a_rod_that_one_side_has_shorter_is_not_beaten(cut):
     rod = np.zeros((64,) * 3, dtype=bool)
