@@ -19,7 +19,9 @@ from typing import Any
 from slatprep.errors import ConfigError, StoreError, printable
 from slatprep.export.formats import COLUMNS
 from slatprep.records import MATERIAL_CLASSES, PROPERTIES, Contents
+from slatprep.storage.documents import parse_document, read_bounded
 from slatprep.store import Store
+from slatprep.store.contract import MAX_METADATA_BYTES
 
 CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
 
@@ -147,13 +149,7 @@ def description_of(contents: Contents) -> str:
 
 def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
     """Describe the root's metadata as a file, and each array as a set of files."""
-    import zarr
-
-    path = store.path / "zarr.json"
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read ({error.strerror})") from error
+    content = _root_of(store)
     root = {
         "@type": "cr:FileObject",
         "@id": "store",
@@ -165,16 +161,29 @@ def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
         "encodingFormat": "application/json",
         "sha256": hashlib.sha256(content).hexdigest(),
     }
-    arrays = sorted(store.group.members(max_depth=None))
-    sets = [_file_set(name, one, location) for name, one in arrays if isinstance(one, zarr.Array)]
-    return [root, *sets]
+    arrays = sorted(entry for entry in store.metadata.items() if entry[1]["node_type"] == "array")
+    return [root, *(_file_set(name, array, location) for name, array in arrays)]
 
 
-def _file_set(name: str, array: Any, location: str) -> dict[str, Any]:
-    attributes: Mapping[str, Any] = array.attrs
-    names = array.metadata.dimension_names or ("dimension",) * len(array.shape)
-    dimensions = ", ".join(f"{n} {size}" for n, size in zip(names, array.shape, strict=True))
-    kind = "str" if array.dtype.kind in "OTU" else str(array.dtype)
+def _root_of(store: Store) -> bytes:
+    """Return the root's metadata as they lie there; StoreError if they are not what was opened."""
+    store.require_known()
+    path = store.path / "zarr.json"
+    try:
+        content = read_bounded(path, MAX_METADATA_BYTES)
+        document = parse_document(content)
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be read ({error})") from error
+    if document != store.document:
+        raise StoreError(f"{path}: is not what was opened (was the store replaced?); open it again")
+    return content
+
+
+def _file_set(name: str, array: Mapping[str, Any], location: str) -> dict[str, Any]:
+    attributes, shape = array.get("attributes", {}), array["shape"]
+    names = array.get("dimension_names") or ("dimension",) * len(shape)
+    dimensions = ", ".join(f"{n} {size}" for n, size in zip(names, shape, strict=True))
+    kind = "str" if array["data_type"] == "string" else array["data_type"]
     units = f" [{attributes['units']}]" if "units" in attributes else ""
     return {
         "@type": "cr:FileSet",
@@ -247,12 +256,11 @@ def _properties(store: Store) -> dict[str, Any]:
 
 
 def _assets(store: Store) -> dict[str, Any]:
-    group: Any = store.group["asset"]
     fields, columns = {}, []
     for name in ("id", *COLUMNS):
         column = store.column(name)
         kind = "sc:Float" if column.dtype.kind == "f" else "sc:Text"
-        fields[name] = kind, str(group[name].attrs.get("description", ""))
+        fields[name] = kind, store.metadata[f"asset/{name}"]["attributes"].get("description", "")
         # JSON has no NaN, which is the only value that differs from itself.
         columns.append([value if value == value else None for value in column.tolist()])
     fields["first_row"] = "sc:Integer", "its first row of voxel/*"

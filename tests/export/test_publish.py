@@ -21,6 +21,7 @@ from support.made_store import make_store, rewrite
 from support.published_hub import PublishedHub
 from support.trees import tree
 
+from slatprep import StoreError
 from slatprep.export.croissant import Stated, describe, to_json
 from slatprep.export.publish import card_of
 from slatprep.pipeline.dataset import BuildSummary
@@ -254,6 +255,21 @@ def test_croissant_says_what_a_store_of_other_contents_holds(tmp_path):
         assert sets == {"properties", "assets", *(["materials"] if classes else [])}
         assert "| density | g/cm³ | log10 |" in card and "youngs_modulus" not in card
         assert not any(word in text for word in ("PixieVerse material", "Young", "PhysGaussian"))
+
+
+@pytest.mark.parametrize("other", ["voxel/feats/zarr.json", "voxel/feats/c/0/0", None])
+def test_croissant_states_no_digest_of_a_root_that_is_another(copy, other):
+    root = copy / "zarr.json"
+    store, kept = open_store(copy), root.read_bytes()
+    describe(store)
+    more = json.loads(kept)
+    more["attributes"]["manifest"] = "0" * 64
+    root.write_bytes((copy / other).read_bytes() if other else json.dumps(more).encode())
+    with pytest.raises(StoreError, match=r"zarr\.json: (is not what was opened|cannot be read)"):
+        describe(store)
+    root.write_bytes(kept)
+    (digest,) = (one["sha256"] for one in describe(store)["distribution"] if "sha256" in one)
+    assert digest == hashlib.sha256(kept).hexdigest()
 
 
 def test_croissant_describes_figures_that_are_not_numbers(store, tmp_path):
