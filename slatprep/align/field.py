@@ -43,7 +43,7 @@ from slatprep.align.pair import (
     Pair,
 )
 from slatprep.align.pose import Pose, Similarity
-from slatprep.align.quality import compare, measure_quality
+from slatprep.align.quality import compare
 from slatprep.align.search import ranked, repeated, search_all
 from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.align.surface import surface_of
@@ -57,6 +57,7 @@ from slatprep.records import (
     Ground,
     MaterialField,
     Placement,
+    Quality,
     Search,
     StructuredLatents,
 )
@@ -220,12 +221,14 @@ def fitted_near(
 
 def lead_of_another(
     transform: NDArray[np.float64],
+    quality: Quality,
     field: MaterialField,
     latents: StructuredLatents,
     parameters: AlignParameters,
 ) -> float:
     """Return by how much another placement clearly beats a given one in score; NaN if none does.
 
+    `quality` is that of the given one.
     The given one may be off by `DISTINCT` at most, as it is polished. If it is off farther, the
     polished one is another placement, and beats it if it halves what the score lacks of 1. Others
     beat it by `BEATEN`, or by `BETTER`; from the score `FINE` on none is searched for. If one side
@@ -233,15 +236,13 @@ def lead_of_another(
     """
     pair = _pair_of(field, latents, parameters)
     given = Pose(Similarity.of(transform))
-    (own,) = pair.refine([given], POLISH_SAMPLES, (), 0.0)
-    (near,) = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
-    quality = measure_quality(field, latents, transform, parameters.radius)
     less, more = sorted((1.0 - quality.fitness, 1.0 - quality.fitness_backward))
     better = BETTER if less > 0.5 * more else 1.0
-    if pair.apart([near], given)[0] < DISTINCT:
-        own = near
-    elif better < 1.0 and near.score > 0.5 * (1.0 + own.score):
-        return near.score - own.score
+    (own,) = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
+    if pair.apart([own], given)[0] >= DISTINCT:
+        near, (own,) = own, pair.refine([given], POLISH_SAMPLES, (), 0.0)
+        if better < 1.0 and near.score > 0.5 * (1.0 + own.score):
+            return near.score - own.score
     least = max(POOR, own.score + min(BEATEN, better * (1.0 - own.score)))
     others = pair.others(given, _search(pair).poses) if own.score < FINE else []
     return max((pose.score - own.score for pose in others if pose.score > least), default=nan)

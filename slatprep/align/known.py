@@ -22,12 +22,13 @@ def align(
     """Take the frame that the field states; see `slatprep.align.align`."""
     transform = np.eye(4) if field.frame is None else field.frame
     _, _, scale = split_transform(transform)
+    quality = measure_quality(field, latents, transform, parameters.radius)
     return Alignment(
         transform=transform,
         engine=Engine.KNOWN,
         model=Model.RIGID if abs(scale - 1.0) < 1e-6 else Model.SIMILARITY,
         search=Search.NONE,
-        quality=measure_quality(field, latents, transform, parameters.radius),
+        quality=quality,
         # Placements that fit as well do not count: the source says which of them is right.
-        margin=-lead_of_another(transform, field, latents, parameters),
+        margin=-lead_of_another(transform, quality, field, latents, parameters),
     )

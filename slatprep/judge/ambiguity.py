@@ -37,9 +37,9 @@ def measure_ambiguity(
     """Measure how the labels change between placements that fit about equally well.
 
     The alignment's transform is compared with the ``placements`` that tie, without a deformation,
-    as they have none. The share counts SLAT voxels that have `other_labels` in any of them. The
-    change of a property is the largest mean absolute change, over the voxels valid in both; of
-    log10 if it is normalised so.
+    as they have none. The share counts SLAT voxels that have other labels (`compare_labels`) in
+    any of them. The change of a property is the largest mean absolute change, over the voxels valid
+    in both; of log10 if it is normalised so.
 
     If there are more than `MOST_VOXELS` voxels, an even choice of at most a fourth of that number
     is compared.
@@ -56,33 +56,34 @@ def measure_ambiguity(
             sample(field, places_of(centres, transform), parameters, labels_alone=True)
             for transform in transforms
         )
-        mapped = to_mapped(best.properties, field.table)
         for other in others:
-            differs |= other_labels(field, best, other)
-            delta = np.abs(mapped - to_mapped(other.properties, field.table))
-            both = best.valid & other.valid
-            change = np.maximum(change, delta[both].sum(axis=0) / max(1, np.count_nonzero(both)))
+            own, mean = compare_labels(field, best, other)
+            differs |= own
+            change = np.maximum(change, mean)
     return Ambiguity(
         material_share=float(differs.mean()),
         property_change=tuple(change.tolist()),
     )
 
 
-def other_labels(field: MaterialField, one: Annotation, other: Annotation) -> NDArray[np.bool_]:
-    """Return which voxels (N,) have another class, or notably other properties, in `other`.
+def compare_labels(
+    field: MaterialField, one: Annotation, other: Annotation
+) -> tuple[NDArray[np.bool_], Array]:
+    """Return which voxels (N,) have other labels in `other`, and the mean changes (P,).
 
-    A property, compared where both are valid, must differ by more than counts as the same where
-    annotations are merged. If it is not normalised in log10, it must also differ by `NOTABLE`.
+    Other labels are another class, or notably other properties. A property, compared where both
+    are valid, must differ by more than counts as the same where annotations are merged. If it is
+    not normalised in log10, it must also differ by `NOTABLE`.
     """
-    differs: NDArray[np.bool_] = one.material != other.material
+    differs, both = one.material != other.material, one.valid & other.valid
     # Most voxels keep their properties, so log10 is taken of the changed ones only.
     columns = zip(one.properties.T, other.properties.T, strict=True)
-    changed = np.any([own != its for own, its in columns], axis=0)
-    rows = np.flatnonzero(changed & ~differs & one.valid & other.valid)
+    rows = np.flatnonzero(both & np.any([own != its for own, its in columns], axis=0))
     first, second = (to_mapped(of.properties[rows], field.table) for of in (one, other))
+    delta = np.abs(first - second)
     limits = same_within(np.maximum(np.abs(first), np.abs(second)), field.table, notable(field))
-    differs[rows] = (np.abs(first - second) > limits).any(axis=1)
-    return differs
+    differs[rows] |= (delta > limits).any(axis=1)
+    return differs, delta.sum(axis=0) / max(1, np.count_nonzero(both))
 
 
 @lru_cache(maxsize=1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
-from slatprep.judge.ambiguity import NOTABLE, notable, other_labels, thinning
+from slatprep.judge.ambiguity import NOTABLE, compare_labels, notable, thinning
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import UNANNOTATED, Alignment, Annotation, MaterialField, StructuredLatents
 from slatprep.sample import TOLERANCE, same_within, voxel_index_of
@@ -118,7 +118,7 @@ def _tied(
         there = voxel_index_of(field).at(places_of(latents.centres, placement.transform))
         properties, material = field.properties[there], field.material[there]
         held = replace(annotation, properties=properties, material=material)
-        tied += (there >= 0) & other_labels(field, annotation, held)
+        tied += (there >= 0) & compare_labels(field, annotation, held)[0]
     tied *= np.float32(len(ties) / len(some) / (len(ties) + 1))
     if tied.mean() <= HARMLESS:
         tied[:] = 0.0  # Ties count as one: the chosen labels are right as often.

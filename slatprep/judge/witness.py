@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, expit, logsumexp, softmax
 
 from slatprep.geometry.frames import Array, places_of
-from slatprep.judge.ambiguity import other_labels
+from slatprep.judge.ambiguity import compare_labels
 from slatprep.judge.evidence import HARMLESS
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
@@ -234,7 +234,7 @@ def weigh(
     differing = np.zeros((len(labels),) * 2, dtype=np.int64)
     rows = np.flatnonzero((labels != UNANNOTATED).all(axis=0))
     for i, j in combinations(range(len(labels)), 2):
-        count = np.count_nonzero(other_labels(field, found[i], found[j])[rows])
+        count = np.count_nonzero(compare_labels(field, found[i], found[j])[0][rows])
         differing[i, j] = differing[j, i] = count
     support = np.array([likely[rows, one[rows]].sum() for one in labels])
     return LatentEvidence(

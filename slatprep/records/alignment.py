@@ -81,7 +81,7 @@ class Ambiguity:
     """The effect of distinct, about equally good placements on the supervision.
 
     ``material_share`` is the share of SLAT voxels whose class or properties in any tied placement
-    differ from those in the best, as `slatprep.judge.ambiguity.other_labels` says.
+    differ from those in the best, as `slatprep.judge.ambiguity.compare_labels` says.
     ``property_change`` is the largest mean absolute change of each property, in log10 if the
     property is normalised in log10. All are 0 without ties.
     """

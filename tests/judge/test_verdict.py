@@ -12,7 +12,7 @@ from slatprep.align import align
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import cube_symmetries, make_transform
 from slatprep.judge import THRESHOLDS, judge, measure_ambiguity, verdict_of
-from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, other_labels, thinning
+from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, compare_labels, thinning
 from slatprep.judge.evidence import FIGURES, surroundings_of
 from slatprep.judge.verdict import contradicted, merged
 from slatprep.parameters import AlignParameters, SampleParameters
@@ -332,8 +332,8 @@ def test_other_labels_by_hand():
         for part in (numbers[:, :3], numbers[:, 3:6])
     )
     expected = [row[-1] for row in rows]
-    assert other_labels(field, one, two).tolist() == expected
-    assert other_labels(field, two, one).tolist() == expected
+    assert compare_labels(field, one, two)[0].tolist() == expected
+    assert compare_labels(field, two, one)[0].tolist() == expected
 
 
 def test_a_box_with_a_painted_end_by_hand():
