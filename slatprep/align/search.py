@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
@@ -101,22 +100,25 @@ def repeated(pair: Pair, best: Pose) -> list[Pose]:
     What repeats itself, such as stairs, a comb or a gear, fits after such a move nearly as well.
     Starts that lay the centroids on each other may then miss the right placement.
     """
+    from scipy.spatial.transform import Rotation
+
     axes, centre = pair.principal[0].T, pair.slat.centroid
-    half = [2.0 * np.outer(axis, axis) - np.eye(3) for axis in axes]
-    angles = np.radians(np.arange(0, 360, TURN))[:, None, None]
-    moves = []
-    for axis, across in zip(axes, np.roll(half, -1, axis=0), strict=True):
-        along = np.outer(axis, axis)
-        turns = along + np.cos(angles) * (np.eye(3) - along)
-        turns = turns + np.sin(angles) * np.cross(np.eye(3), axis)
-        moves += [(turn, 0.0 * axis) for turn in [*turns[1:], *(turns @ across)]]
-        most = min(MOST_SLID, REACH * float(np.ptp(pair.slat.points @ axis)))
-        slides = np.arange(SLIDE, most, SLIDE)
-        moves += product([np.eye(3), *half], np.concatenate([slides, -slides])[:, None] * axis)
-    own, away = best.similarity, best.similarity.shift - centre
+    half = 2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
+    angles = np.radians(np.arange(0, 360, TURN))
+    vectors = (axes[:, None, :] * angles[:, None]).reshape(-1, 3)
+    about = Rotation.from_rotvec(vectors).as_matrix().reshape(3, -1, 3, 3)
+    across = about @ np.roll(half, -1, axis=0)[:, None]
+    turns = np.concatenate([about[:, 1:], across], axis=1).reshape(-1, 3, 3)
+    by = np.outer([1.0, -1.0], np.arange(SLIDE, MOST_SLID, SLIDE)).reshape(-1, 1)
+    far = REACH * np.ptp(axes @ pair.slat.points.T, axis=1)
+    slides = (by[:, :, None] * axes)[np.abs(by) < far]
+    turned = np.concatenate([turns, np.repeat([np.eye(3), *half], len(slides), axis=0)])
+    moved = np.concatenate([np.zeros((len(turns), 3)), *[slides] * 4])
+    own = best.similarity
+    shifts = turned @ (own.shift - centre) + centre + moved
     starts = [
-        Pose(own._replace(rotation=turn @ own.rotation, shift=turn @ away + centre + by))
-        for turn, by in moves
+        Pose(own._replace(rotation=rotation, shift=shift))
+        for rotation, shift in zip(turned @ own.rotation, shifts, strict=True)
     ]
     halfway = pair.refine(starts, REPEATED_SAMPLES, (3.0, 2.0), 0.02)
     kept = sorted(halfway, key=lambda pose: -pose.score)[:REPEATED_KEPT]
