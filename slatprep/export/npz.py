@@ -69,7 +69,7 @@ def write_latents(model: str, directory: Path, asset: StoredAsset) -> Exported:
     """
     arrays = _arrays(asset, "coords", *TARGETS)
     space = asset.store.contents.latents
-    arrays |= space.beside_voxels
+    arrays |= space.beside_voxels | asset.store.normalization.beside_properties
     # TRELLIS's dataset standardises the latents that it reads.
     arrays["feats"] = space.as_encoded(asset.feats)
     name = str(PurePosixPath("latents", model, f"{_stem(asset.asset_id)}.npz"))

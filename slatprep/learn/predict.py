@@ -239,8 +239,7 @@ def write_prediction(
         np.savez_compressed(
             stream,
             **vars(field),
-            ranges=np.array([[span.lo, span.hi] for span in checkpoint.normalization.ranges]),
-            columns=np.array([span.name for span in checkpoint.normalization.ranges]),
+            **checkpoint.normalization.beside_properties,  # type: ignore[arg-type]
             checkpoint=np.array(checkpoint.sha256),
             **checkpoint.contents.latents.beside_voxels,  # type: ignore[arg-type]
         )

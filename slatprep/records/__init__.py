@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as with_default
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import MaxLen, MinLen
@@ -157,6 +157,14 @@ class Normalization:
 
     ranges: Annotated[tuple[PropertyRange, ...], MinLen(1), MaxLen(MAX_PROPERTIES)]
     source: str
+
+    @property
+    def beside_properties(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a file beside normalised properties: ``columns`` (P,) and ``ranges`` (P, 2)."""
+        return {
+            "columns": np.array([one.name for one in self.ranges]),
+            "ranges": np.array([(one.lo, one.hi) for one in self.ranges]),
+        }
 
 
 @dataclass(frozen=True, eq=False)

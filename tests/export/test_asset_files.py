@@ -17,6 +17,7 @@ from support.synthetic import JELLY, METAL, QUARTER_TURN, MakeDataset
 from slatprep.errors import ConfigError, StoreError
 from slatprep.export import ExportOptions, export_store
 from slatprep.export.ply import VERTEX, write_points
+from slatprep.learn.metrics import evaluate_store
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import MATERIAL_CLASSES
 from slatprep.store import open_store
@@ -61,7 +62,8 @@ def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
     for asset_id, asset in mixed.assets.items():
         with np.load(tmp_path / "root" / "latents" / ENCODER / f"{asset_id}.npz") as data:
             assert sorted(data) == [
-                "confidence", "coords", "feats", "material", "properties", "valid",
+                "columns", "confidence", "coords", "feats", "material", "properties", "ranges",
+                "valid",
             ]  # fmt: skip
             np.testing.assert_array_equal(data["coords"], asset.coords)
             np.testing.assert_array_equal(data["feats"], asset.feats)
@@ -70,6 +72,20 @@ def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
             for material, ends in ((JELLY[0], (-1, -1, 1)), (METAL[0], (1, 1, -1))):
                 here = data["material"] == material
                 np.testing.assert_allclose(data["properties"][here], [ends] * here.sum())
+
+
+@pytest.mark.parametrize("form", ["npz", "hdf5"])
+def test_exported_labels_are_right_in_a_store_of_other_ranges(form, make_dataset, tmp_path):
+    dataset = make_dataset("cup")
+    build_store(dataset.parameters(), tmp_path / "first.zarr")
+    export_store(tmp_path / "first.zarr", out := tmp_path / f"out.{form}", form)
+    dataset.add("dog", seed=1)
+    dataset.write_grid("dog", dataset.assets["dog"].grid * [2.0, 0.1, 0.9, 1.0])
+    build_store(dataset.parameters(), tmp_path / "second.zarr")
+    said = out / "latents" / ENCODER if form == "npz" else out
+    report = evaluate_store(said, tmp_path / "second.zarr", None)
+    assert report.converted == 1
+    assert report.overall.means["mean"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_names_that_pandas_takes_for_numbers_or_nothing_are_found(copy, tmp_path):
