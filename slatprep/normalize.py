@@ -202,4 +202,4 @@ def normalize_change(change: ArrayLike, normalization: Normalization) -> NDArray
 
 
 def _ends(normalization: Normalization) -> NDArray[np.float64]:
-    return np.array([[one.lo, one.hi] for one in normalization.ranges]).T
+    return normalization.spans.T

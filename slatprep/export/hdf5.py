@@ -60,8 +60,7 @@ def _write_group(file: h5py.File, asset: StoredAsset) -> None:
             dataset.attrs["columns"] = [one.name for one in table]
             if name == "properties_si":
                 dataset.attrs["units"] = [one.unit for one in table]
-    beside = asset.store.normalization.beside_properties
-    ranges = group.create_dataset("ranges", data=beside["ranges"])
+    ranges = group.create_dataset("ranges", data=asset.store.normalization.spans)
     ranges.attrs["description"] = "lo and hi of each property, in log10 where the ranges say so"
 
 

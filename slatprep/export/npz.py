@@ -67,9 +67,10 @@ def write_latents(model: str, directory: Path, asset: StoredAsset) -> Exported:
 
     `model` is the encoder's name, which names the folder.
     """
-    arrays = _arrays(asset, "coords", *TARGETS)
-    space = asset.store.contents.latents
-    arrays |= space.beside_voxels | asset.store.normalization.beside_properties
+    arrays, contents = _arrays(asset, "coords", *TARGETS), asset.store.contents
+    space = contents.latents
+    arrays |= space.beside_voxels | contents.beside_labels
+    arrays["ranges"] = asset.store.normalization.spans
     # TRELLIS's dataset standardises the latents that it reads.
     arrays["feats"] = space.as_encoded(asset.feats)
     name = str(PurePosixPath("latents", model, f"{_stem(asset.asset_id)}.npz"))

@@ -82,7 +82,7 @@ def checkpoint_state(
     model: PhysicsDecoder, size: str, normalization: Normalization, contents: Contents = PIXIEVERSE
 ) -> dict[str, Any]:
     """Return the state of a decoder for a checkpoint: tensors and plain values."""
-    ranges = [[span.lo, span.hi] for span in normalization.ranges]
+    ranges = normalization.spans.tolist()
     # As JSON, since a checkpoint may hold only tensors and plain values.
     held = orjson.dumps(
         {
@@ -224,13 +224,14 @@ def write_prediction(
 ) -> Path:
     """Write a prediction to ``<asset id>.npz`` in a folder and return its path.
 
-    It has the arrays of a `PredictedField`, ``ranges`` (P, 2) and names ``columns`` (P,) of the
-    properties, ``checkpoint`` (the SHA-256 of its file) and ``seconds``. InputError, and no file,
+    It has the arrays of a `PredictedField`, ``ranges`` (P, 2), names of properties and classes,
+    ``checkpoint`` (the SHA-256 of its file) and ``seconds``. InputError, and no file,
     if the prediction is not finite.
     """
+    contents = checkpoint.contents
     values = (field.properties, field.properties_si, field.probabilities)
     if not all(np.isfinite(array).all() for array in values):
-        encoder = checkpoint.contents.latents.encoder
+        encoder = contents.latents.encoder
         raise InputError(
             asset_id, "what is predicted of its latents is not finite", f"latents of {encoder}"
         )
@@ -239,8 +240,9 @@ def write_prediction(
         np.savez_compressed(
             stream,
             **vars(field),
-            **checkpoint.normalization.beside_properties,  # type: ignore[arg-type]
+            ranges=checkpoint.normalization.spans,
             checkpoint=np.array(checkpoint.sha256),
-            **checkpoint.contents.latents.beside_voxels,  # type: ignore[arg-type]
+            **contents.beside_labels,  # type: ignore[arg-type]
+            **contents.latents.beside_voxels,  # type: ignore[arg-type]
         )
     return path

@@ -76,8 +76,11 @@ _SPECS = {
 }
 """The arrays of a prediction; others are not read."""
 
-_NAMES = {"columns": ArraySpec(((range(1, MAX_PROPERTIES + 1),),), "U")}
-"""Names of the properties, in npz files; in others they are an attribute of the properties."""
+_NAMES = {
+    "columns": ArraySpec(((range(1, MAX_PROPERTIES + 1),),), "U"),
+    "classes": ArraySpec(((range(1, MANY_BACKGROUND + 1),),), "U"),
+}
+"""Names of properties and classes in npz files; in others ``columns`` is an attribute."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ def check_prediction(
     given, count, columns = GivenPrediction(source, arrays), len(coords), normalization.ranges
     if "properties" not in arrays:
         raise InputError(source, f"has {', '.join(sorted(arrays)) or 'nothing'}", "properties")
-    given.require_columns(tuple(span.name for span in columns))
+    given.require_names(contents)
     side = given.side(contents.latents.resolution)
     if side != contents.latents.resolution:
         raise InputError(source, f"has a grid of {side}^3", f"{contents.latents.resolution}^3")
@@ -230,19 +233,20 @@ class GivenPrediction:
         What errors name.
     arrays : mapping of str to ndarray
         ``coords`` (N, 3) or (N, 4), ``properties`` or ``properties_si`` (N, P), ``ranges`` (P, 2),
-        ``columns`` (P,), ``material`` (N,) or ``logits`` (N, classes), ``valid`` (N,) and
+        ``columns`` (P,), ``classes``, ``material`` (N,) or ``logits`` (N, classes), ``valid`` (N,),
         ``resolution``; any may be missing.
     """
 
     source: str | Place
     arrays: Mapping[str, NDArray[Any]]
 
-    def require_columns(self, names: tuple[str, ...]) -> None:
-        """Raise InputError if the file names other properties, or these in other order."""
-        named = self.arrays.get("columns")
-        if named is not None and tuple(named.tolist()) != names:
-            what = f"predicts {', '.join(map(str, named.ravel()))}"
-            raise InputError(self.source, what, ", ".join(names))
+    def require_names(self, contents: Contents) -> None:
+        """Raise InputError if the file names other properties or classes, or in other order."""
+        for kind, names in contents.beside_labels.items():
+            named = self.arrays.get(kind, names)
+            if not np.array_equal(named, names):
+                what = f"predicts {', '.join(map(str, named.ravel()))}"
+                raise InputError(self.source, what, f"the {kind} {', '.join(names)}")
 
     def side(self, usual: int) -> int:
         """Return the voxels along an axis, `usual` ones unless the file has another number."""

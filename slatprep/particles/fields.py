@@ -20,6 +20,7 @@ from slatprep.readers.voxel_sets import physical
 from slatprep.records import (
     BACKGROUND,
     MAX_LATENT_RESOLUTION,
+    PIXIEVERSE,
     PROPERTIES,
     PROPERTY_COLUMNS,
     RESOLUTION,
@@ -92,7 +93,7 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
     used or a material cannot have its values, ConfigError if the ranges are not known.
     """
     given = GivenPrediction(path, read_npz(path))
-    given.require_columns(PROPERTY_COLUMNS)  # Solvers need these columns.
+    given.require_names(PIXIEVERSE)  # Solvers need these.
     side = given.side(RESOLUTION)
     if not 2 <= side <= MAX_LATENT_RESOLUTION:
         raise InputError(path, f"has a grid of {side}^3", f"2 to {MAX_LATENT_RESOLUTION} a side")

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as with_default
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from annotated_types import MaxLen, MinLen
@@ -159,12 +159,9 @@ class Normalization:
     source: str
 
     @property
-    def beside_properties(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a file beside normalised properties: ``columns`` (P,) and ``ranges`` (P, 2)."""
-        return {
-            "columns": np.array([one.name for one in self.ranges]),
-            "ranges": np.array([(one.lo, one.hi) for one in self.ranges]),
-        }
+    def spans(self) -> NDArray[np.float64]:
+        """``lo`` and ``hi`` of each property, (P, 2)."""
+        return np.array([(one.lo, one.hi) for one in self.ranges])
 
 
 @dataclass(frozen=True, eq=False)

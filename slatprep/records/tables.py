@@ -320,6 +320,12 @@ class Contents:
         return BACKGROUND if len(self.labels) <= BACKGROUND else MANY_BACKGROUND
 
     @property
+    def beside_labels(self) -> dict[str, NDArray[np.str_]]:
+        """Entries of an npz beside its labels: their ``columns`` and, if any, ``classes``."""
+        columns = {"columns": np.array([one.name for one in self.properties])}
+        return columns | ({"classes": np.array(self.labels)} if self.classes else {})
+
+    @property
     def n_labels(self) -> int:
         """The number of ids that voxels may have, all below the background's."""
         return max(len(self.labels), BACKGROUND)

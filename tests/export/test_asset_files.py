@@ -62,8 +62,8 @@ def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
     for asset_id, asset in mixed.assets.items():
         with np.load(tmp_path / "root" / "latents" / ENCODER / f"{asset_id}.npz") as data:
             assert sorted(data) == [
-                "columns", "confidence", "coords", "feats", "material", "properties", "ranges",
-                "valid",
+                "classes", "columns", "confidence", "coords", "feats", "material", "properties",
+                "ranges", "valid",
             ]  # fmt: skip
             np.testing.assert_array_equal(data["coords"], asset.coords)
             np.testing.assert_array_equal(data["feats"], asset.feats)

@@ -28,8 +28,9 @@ from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 from slatprep.learn.splits import assign_store
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import BuildParameters, NormalizeParameters
+from slatprep.particles.fields import predicted_field
 from slatprep.pipeline.dataset import build_store
-from slatprep.records import PROPERTY_COLUMNS
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS
 
 
 def test_objects_count_alike_whatever_their_views():
@@ -134,6 +135,17 @@ def test_columns_in_another_order_are_not_measured(learn_store, tmp_path):
     folder = write_changed(tmp_path / "p", learn_store, change)
     with pytest.raises(InputError, match="predicts density, youngs_modulus, poissons_ratio"):
         evaluate_store(folder, learn_store, None)
+
+
+def test_classes_in_another_order_are_not_measured(learn_store, tmp_path):
+    def change(_: int, arrays: dict[str, Any], truth: object) -> dict[str, Any]:
+        return arrays | {"classes": np.array(MATERIAL_CLASSES[BACKGROUND - 1 :: -1])}
+
+    folder = write_changed(tmp_path / "p", learn_store, change)
+    with pytest.raises(InputError, match=r"predicts stationary, .*expected the classes jelly, "):
+        evaluate_store(folder, learn_store, None)
+    with pytest.raises(InputError, match="predicts stationary, snow"):
+        predicted_field(next(folder.iterdir()), PIXIE_RANGES)
 
 
 @pytest.mark.parametrize("form", ["zarr", "hdf5"])
