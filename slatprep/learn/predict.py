@@ -7,10 +7,12 @@ ranges, so it serves without the store that the decoder was trained on.
 from __future__ import annotations
 
 import time
+import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import orjson
@@ -225,8 +227,8 @@ def write_prediction(
     """Write a prediction to ``<asset id>.npz`` in a folder and return its path.
 
     It has the arrays of a `PredictedField`, ``ranges`` (P, 2), names of properties and classes,
-    ``checkpoint`` (the SHA-256 of its file) and ``seconds``. InputError, and no file,
-    if the prediction is not finite.
+    ``checkpoint`` (the SHA-256 of its file) and ``seconds``. InputError, and no file, if the
+    prediction is not finite or another file would be replaced.
     """
     contents = checkpoint.contents
     values = (field.properties, field.properties_si, field.probabilities)
@@ -235,7 +237,11 @@ def write_prediction(
         raise InputError(
             asset_id, "what is predicted of its latents is not finite", f"latents of {encoder}"
         )
-    path = folder / f"{file_name(asset_id)}.npz"
+    # The id of a file is its name, already encoded.
+    path = folder / f"{file_name(unquote(asset_id))}.npz"
+    if path.exists() and not _is_prediction(path):
+        fault = "exists and is not a prediction of slatprep"
+        raise InputError(path, fault, "a prediction to replace, or no file: name another --out")
     with staged(path) as file, file.open("wb") as stream:
         np.savez_compressed(
             stream,
@@ -246,3 +252,11 @@ def write_prediction(
             **contents.latents.beside_voxels,  # type: ignore[arg-type]
         )
     return path
+
+
+def _is_prediction(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as held:
+            return "checkpoint.npy" in held.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False

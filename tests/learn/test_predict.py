@@ -157,6 +157,26 @@ def test_one_file_of_either_kind(checkpoint, tmp_path):
         np.testing.assert_allclose(*said, atol=1e-6)
 
 
+def test_a_prediction_replaces_predictions_alone(checkpoint, tmp_path):
+    given, out = tmp_path / "given", tmp_path / "out"
+    for folder in (given, out):
+        folder.mkdir()
+    for name in ("cup", "my chair"):
+        save(given / f"{name}.npz", random_latents(4))
+    (out / "cup.npz").write_text("mine")
+    before = (given / "cup.npz").read_bytes()
+    words = ("--checkpoint", checkpoint, "--out")
+    said = "exists and is not a prediction of slatprep"
+    assert said in refused("predict", given / "cup.npz", *words, given, code=1)
+    assert (given / "cup.npz").read_bytes() == before
+    assert said in refused("predict", given, *words, out, code=1)
+    assert (out / "cup.npz").read_text() == "mine"
+    (out / "cup.npz").unlink()
+    for _ in range(2):
+        run(given, *words, out)
+        assert sorted(path.name for path in out.iterdir()) == ["cup.npz", "my%20chair.npz"]
+
+
 def test_a_store_of_other_ranges_measures_the_same(checkpoint, learn_store, undisturbed, tmp_path):
     """One store is by the ranges of its dataset, the other by Pixie's."""
     for store in (learn_store, undisturbed[1]):
