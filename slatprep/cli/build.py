@@ -311,14 +311,15 @@ def _counts(statuses: Mapping[str, int], aligned: int, failed: str = "not built"
     return f"assets:  {sum(counts.values()):,} ({told})"
 
 
-def _say_removed(count: int, taken_out: Mapping[str, str], there: str) -> None:
+def _say_removed(count: int, taken_out: Mapping[str, str], there: str, err: bool = False) -> None:
     """Print the number of assets that leave the store, and the first three with reasons."""
     if count:
         named = [f"{name} ({why})" for name, why in islice(taken_out.items(), 3)]
         more = f" and {count - 3:,} more" if count > 3 else ""
         say(
             f"removed: {amount(count, 'asset')} of the store that {there} there: "
-            f"{', '.join(named)}{more}"
+            f"{', '.join(named)}{more}",
+            err=err,
         )
 
 
@@ -373,6 +374,8 @@ def report(output: Output, summary: BuildSummary) -> None:
         say(f"records: {summary.records}")
 
     verdicts = {str(verdict): summary.verdicts.get(str(verdict), 0) for verdict in Verdict}
+    if output.verbosity < 0:  # Nobody removes assets unaware.
+        _say_removed(summary.removed, summary.taken_out, "was", err=True)
     output.made(vars(summary) | {"verdicts": verdicts}, show, summary.complete)
 
 

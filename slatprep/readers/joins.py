@@ -130,12 +130,20 @@ def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters)
         hint = f"the table {table} joins none of them"
     else:
         own = root / "metadata.csv"
-        example = own if own.is_file() else "FILE.csv"
+        example = own if own.is_file() and _joins(own, grids, slats) else "FILE.csv"
         hint = f"name a table that joins them: --map {example} (docs/configuration.md, [pairing])"
     return (
         f"no id occurs on both sides: {len(grids):,} grids such as {grids[0][:40]!r}, "
         f"{len(slats):,} SLATs such as {slats[0][:40]!r}; {hint}"
     )
+
+
+def _joins(table: Place, grids: Collection[str], slats: Collection[str]) -> bool:
+    """Return whether a table is a map of ids that names one of these."""
+    try:
+        return bool(read_map(table, grids, slats))
+    except ConfigError:
+        return False
 
 
 def by_case(grids: Iterable[str], slats: Iterable[str]) -> dict[str, str]:

@@ -14,6 +14,7 @@ from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import source_adapter
 from slatprep.readers.patterns import LOOKED_AT, fill, held_names
+from slatprep.readers.voxels import DESCRIPTION
 from slatprep.records import AssetPair, Place
 from slatprep.storage.archives import is_archive, shown
 from slatprep.storage.members import ArchivePlace, ArchiveTree, fetch
@@ -111,6 +112,9 @@ def hint_of(source: PixieverseSource) -> str:
             return f"it is a sample of one object; point at {place.parent.parent}"
         if any(name.startswith("sample_") for name in folders):
             return f"it is the folder of one object; point at {place.parent}"
+        if DESCRIPTION in files and source.adapter == PixieverseSource.adapter:
+            way = 'say adapter = "voxels" in [pixieverse] of the dataset definition'
+            return f"it holds {DESCRIPTION}, which describes plain voxels; {way}"
         if known := sorted(OTHERS.keys() & {*folders}):
             return f"it holds Pixie's {', '.join(known)}, and no {GRIDS}, which has the grids"
         inner = [place / name for name in sorted(folders)]

@@ -171,6 +171,9 @@ def test_names_without_anything_in_common_are_told_in_one_line(make_dataset, tmp
         "There is no store"
     )
     table = dataset.root / "slat/metadata.csv"
+    table.write_text("sha256,num_voxels\nchair_0,9\n")  # As an export to npz has it.
+    with pytest.raises(StoreError, match=r"--map FILE\.csv "):
+        build_store(dataset.parameters(), tmp_path / "s.zarr")
     table.write_text("object_id,slat_id\nother,thing\n")
     with pytest.raises(StoreError, match=rf"--map {table} "):
         build_store(dataset.parameters(), tmp_path / "s.zarr")

@@ -62,6 +62,8 @@ def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     assert "removed" not in run("subset", out, "--asset", "b", "--out", other).stdout
     said = run("subset", out, "--asset", "c", "--out", other).stdout
     assert "assets:  1 copied in" in said and "removed: 1 asset" in said
+    quiet = run("subset", out, "--asset", "b", "--out", other, "--quiet")
+    assert (quiet.stdout, quiet.stderr[:16]) == ("", "removed: 1 asset")
     fresh = document("build-store", *words, "--out", other, "--fresh", code=1)
     assert (fresh["removed"], fresh["unchanged"]) == (0, False)
 

@@ -463,6 +463,8 @@ UNPACK = "SLATs are read unpacked: `tar -xf ARCHIVE -C FOLDER`"
          "pixie/render_outputs"),
         (".", "slat", f"{NO_GRIDS}grids lie in", "pixie"),
         ("slat", "slat", f"{NO_GRIDS}it holds a.npz, b.npz", ""),
+        ("plain", "slat", f"{NO_GRIDS}it holds source.json, which describes plain voxels; say "
+         'adapter = "voxels"', ""),
         ("partly", "slat", "holds Pixie's data, outputs, and no render_outputs", "partly"),
         ("slat", "pixie", "the roots are swapped: grids lie below", ""),
         ("classes.json", "slat", "is another file; expected PixieVerse's folder or an", ""),
@@ -477,6 +479,7 @@ UNPACK = "SLATs are read unpacked: `tar -xf ARCHIVE -C FOLDER`"
 def test_whoever_points_elsewhere_is_told_what_lies_there(root, grids, slats, told, instead):
     if grids != ".":  # There all of it would be in sight.
         touch(root, "partly/data/a/train/000.png", "partly/outputs/a/mesh.ply", "classes.json")
+        touch(root, "plain/source.json", "plain/a.npz")
         touch(root, "deep/trellis/latents/model/a.npz", "tars/none")
         for name in ("slats.tar", "slats.tar.gz", "tars/slats.tar"):
             pack(root / name, [root / "slat" / "a.npz"])
