@@ -293,11 +293,11 @@ def _show_plan(output: Output, plan: BuildPlan) -> None:
             rows = (tuple(one.values()) for one in shown)
             output.table("What would be done", ("asset", "action", "why"), rows)
         say(_counts(plan.statuses, plan.actions["align"]))
-        _say_removed(len(plan.taken_out), plan.taken_out, "is")
         say(f"store:   {plan.store} (a dry run: nothing is written)")
 
     counts = {"actions": plan.actions, "statuses": plan.statuses, "removed": len(plan.taken_out)}
     complete = plan.statuses["ok"] == sum(plan.statuses.values())
+    _tell_removed(output, len(plan.taken_out), plan.taken_out, "is")
     output.result(vars(plan) | counts | {"assets": assets}, show, complete)
 
 
@@ -311,15 +311,14 @@ def _counts(statuses: Mapping[str, int], aligned: int, failed: str = "not built"
     return f"assets:  {sum(counts.values()):,} ({told})"
 
 
-def _say_removed(count: int, taken_out: Mapping[str, str], there: str, err: bool = False) -> None:
-    """Print the number of assets that leave the store, and the first three with reasons."""
+def _tell_removed(output: Output, count: int, taken_out: Mapping[str, str], verb: str) -> None:
+    """Tell the number of assets that leave the store, and the first three with reasons."""
     if count:
         named = [f"{name} ({why})" for name, why in islice(taken_out.items(), 3)]
         more = f" and {count - 3:,} more" if count > 3 else ""
-        say(
-            f"removed: {amount(count, 'asset')} of the store that {there} there: "
-            f"{', '.join(named)}{more}",
-            err=err,
+        output.problem(
+            f"removed: {amount(count, 'asset')} of the store that {verb} there: "
+            f"{', '.join(named)}{more}"
         )
 
 
@@ -368,14 +367,12 @@ def report(output: Output, summary: BuildSummary) -> None:
         say(f"{counts} in {summary.seconds:,.1f} s")
         if summary.unchanged:
             say("changed: nothing")
-        _say_removed(summary.removed, summary.taken_out, "was")
         if summary.store is not None:
             say(f"store:   {summary.store}")
         say(f"records: {summary.records}")
 
     verdicts = {str(verdict): summary.verdicts.get(str(verdict), 0) for verdict in Verdict}
-    if output.verbosity < 0:  # Nobody removes assets unaware.
-        _say_removed(summary.removed, summary.taken_out, "was", err=True)
+    _tell_removed(output, summary.removed, summary.taken_out, "was")
     output.made(vars(summary) | {"verdicts": verdicts}, show, summary.complete)
 
 

@@ -167,7 +167,7 @@ def _distribution(store: Store, location: str) -> list[dict[str, Any]]:
 
 def _root_of(store: Store) -> bytes:
     """Return the root's metadata as they lie there; StoreError if they are not what was opened."""
-    store.require_known()
+    _ = store.group  # It refuses metadata that zarr-python could not read.
     path = store.path / "zarr.json"
     try:
         content = read_bounded(path, MAX_METADATA_BYTES)

@@ -325,7 +325,7 @@ class AssetTable:
         """
         import zarr
 
-        self.require_known()
+        self._refuse(f for entry in self.metadata.items() for f in gate_findings(*entry))
         remote = storage_of(self.path).remote
         try:
             # Consolidated, so that zarr-python reads only the metadata that were just checked.
@@ -335,10 +335,6 @@ class AssetTable:
                 )
         except (*BAD_METADATA, OSError) as error:
             raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
-
-    def require_known(self) -> None:
-        """Raise StoreError if the metadata name anything that no store has; as `group`."""
-        self._refuse(f for entry in self.metadata.items() for f in gate_findings(*entry))
 
     def holds(self, name: str) -> bool:
         """Return whether the store has an array, by its full name."""

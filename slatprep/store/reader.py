@@ -18,6 +18,7 @@ from slatprep.errors import ConfigError, StoreError, amount
 from slatprep.geometry.voxels import shown_in_cells, voxels_at
 from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents
+from slatprep.records.tables import words_of
 from slatprep.storage.documents import read_document
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
@@ -198,15 +199,15 @@ class Store(AssetTable):
         return self.asset(name)
 
     def read(
-        self, index: str | int, columns: Sequence[str] = TRAINING_COLUMNS
+        self, index: str | int, columns: str | Sequence[str] = TRAINING_COLUMNS
     ) -> dict[str, NDArray[Any]]:
         """Read rows of ``voxel/*`` of one asset, fast, as training needs it.
 
         Parameters
         ----------
         index : str or int
-            Which asset, 0 to ``len(store) - 1``, or its id; see `match`.
-        columns : sequence of str
+            Which asset, by number or by id; see `match`.
+        columns : str or sequence of str
             Last names of ``voxel/*`` arrays: ``coords``, ``feats``,
             ``properties``, ``material``, ``valid``, ``distance``, ``place``,
             ``confidence``, ``spread``, ``votes``.
@@ -222,6 +223,7 @@ class Store(AssetTable):
             If there is no such asset or array, or a file is missing or damaged.
         """
         start, stop = self.rows(self.match(index) if isinstance(index, str) else index)
+        columns = words_of(columns)
         if storage_of(self.path).local is not None:
             return {name: self._voxel_rows(name, start, stop) for name in columns}
         # Each array is an object of its own, and each answer takes long, so all are asked for at
@@ -247,8 +249,9 @@ class Store(AssetTable):
         StoreError
             If there is no such asset, or its rows are invalid.
         """
-        if not 0 <= index < len(self):
+        if not -len(self) <= index < len(self):
             raise StoreError(f"{self.path} has no asset {index}; it has {len(self)} assets")
+        index %= len(self)
         start, stop = self.offsets[index : index + 2].tolist()
         if not 0 <= start <= stop <= start + MAX_VOXELS:
             raise StoreError(

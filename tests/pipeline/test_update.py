@@ -55,13 +55,13 @@ def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     rows = [line.split()[:2] for line in again.splitlines() if line[:2] in ("a ", "b ", "c ")]
     assert rows == [[name, "good"] for name in "abc"]
     (dataset.root / "slat" / "a.npz").unlink()
-    less = run("build-store", *words, "--out", out, "--decoys", "0", code=1).stdout
-    assert "removed: 1 asset of the store that was there: a (cannot be" in less
-    assert "changed" not in less
+    less = run("build-store", *words, "--out", out, "--decoys", "0", code=1)
+    assert "removed: 1 asset of the store that was there: a (cannot be" in less.stderr
+    assert "changed" not in less.stdout
     other = out.with_name("other.zarr")
-    assert "removed" not in run("subset", out, "--asset", "b", "--out", other).stdout
-    said = run("subset", out, "--asset", "c", "--out", other).stdout
-    assert "assets:  1 copied in" in said and "removed: 1 asset" in said
+    assert "removed" not in run("subset", out, "--asset", "b", "--out", other).output
+    said = run("subset", out, "--asset", "c", "--out", other)
+    assert "assets:  1 copied in" in said.stdout and "removed: 1 asset" in said.stderr
     quiet = run("subset", out, "--asset", "b", "--out", other, "--quiet")
     assert (quiet.stdout, quiet.stderr[:16]) == ("", "removed: 1 asset")
     fresh = document("build-store", *words, "--out", other, "--fresh", code=1)
@@ -105,10 +105,9 @@ def test_a_dry_run_counts_what_the_build_removes_and_both_say_why(built):
     ahead = document(*words, "--dry-run", code=1)
     assert (ahead["ok"], ahead["removed"]) == (False, 2)
     for verb, more in (("is", ["--dry-run"]), ("was", [])):
-        printed = run(*words, *more, code=1).stdout
-        assert (
-            counted in printed and f"removed: 2 assets of the store that {verb} {said}" in printed
-        )
+        printed = run(*words, *more, code=1)
+        assert counted in printed.stdout
+        assert f"removed: 2 assets of the store that {verb} {said}" in printed.stderr
     grid = next(dataset.root.glob("pixieverse/**/c*/**/*.npy"))
     grid.write_bytes(grid.read_bytes()[:-100])
     dataset.add("d", seed=3)

@@ -170,6 +170,10 @@ def test_assets_are_taken_by_number_id_beginning_and_slice(made):
     assert [asset.asset_id for asset in store[::-1]] == list(IDS[::-1])
     assert [asset.asset_id for asset in store] == list(IDS)
     assert same(store.read(IDS[0])["coords"], store.read(0)["coords"])
+    assert same(store.read(-4, "coords")["coords"], store.read(0)["coords"])
+    for number in (4, -5):
+        with pytest.raises(StoreError, match=f"has no asset {number}; it has 4 assets"):
+            store.read(number)
     with pytest.raises(StoreError, match=r"has no column 'coordz'; did you mean coords\?"):
         store.read(0, columns=("coordz",))
 
@@ -263,7 +267,7 @@ def test_rows_beyond_what_an_asset_may_have_are_refused(own):
     for row in (2, 3):
         with pytest.raises(StoreError, match=f"asset {row} has rows .* expected 0 to 262144 rows"):
             store.rows(row)
-    for row in (-1, 4):
+    for row in (-5, 4):
         with pytest.raises(StoreError, match=f"has no asset {row}; it has 4 assets"):
             store.rows(row)
     offsets[:2] = [-1, 4]
