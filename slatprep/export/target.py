@@ -17,8 +17,8 @@ from typing import Any
 
 import orjson
 
-from slatprep.errors import ConfigError, SlatprepError
-from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged
+from slatprep.errors import ConfigError
+from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged, writing
 from slatprep.storage.files import locks_alone
 
 FORMAT = "slatprep-export"
@@ -44,7 +44,7 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
     own = _files_of_export(out, kind) if out.exists() else frozenset()
     if own is None:
         raise _not_an_export(out, "folder")
-    with _writable(out):
+    with writing(str(out), out.parent):
         out.parent.mkdir(parents=True, exist_ok=True)
         _remove_killed(out)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
@@ -52,7 +52,7 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
         held = _locked(work)
         new = work / _NEW
         new.mkdir()
-        with _writable(out):
+        with writing(str(out), out.parent):
             yield new
             if out.exists() and (others := set(_names_below(out)) - own):
                 _replace_files(new, out, own, others)
@@ -103,7 +103,7 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
     out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):
         raise _not_an_export(out, "file")
-    with _writable(out), staged(out) as path:
+    with writing(str(out), out.parent), staged(out) as path:
         yield path
 
 
@@ -179,13 +179,3 @@ def _not_an_export(out: Path, wanted: str) -> ConfigError:
         f"{out} exists and is not an export of slatprep; expected an export to replace, "
         "or a new path"
     )
-
-
-@contextmanager
-def _writable(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise SlatprepError(
-            f"{out}: cannot write there ({error.strerror or error}); nothing was replaced"
-        ) from error

@@ -119,7 +119,7 @@ def work_beside(
     spool = spool_of(target, private_disks, arrays)
     finished, lock, work = False, None, None
     try:
-        with _making(directory):
+        with writing(str(target), directory.parent):
             _claim(directory)
             reached("work folder made", directory.name)
             lock = take_lock(directory / LOCK, f"{target}: another build is writing it")
@@ -202,17 +202,6 @@ def _restore(directory: Path, target: Place) -> None:
     local = storage_of(target).local
     if local is not None:
         restore_directory(directory, local)
-
-
-@contextmanager
-def _making(directory: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StoreError(
-            f"{directory.parent}: cannot write there ({error.strerror}); "
-            "expected a folder for the result and for temporary files"
-        ) from error
 
 
 def _claim(directory: Path) -> None:

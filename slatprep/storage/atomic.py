@@ -166,7 +166,7 @@ def writing(what: str, where: Place) -> Iterator[None]:
         advice = "Make room there" if full else "Name a place that may be written"
         raise StoreError(
             f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "
-            f"replaced. {advice} and run again: what is finished is kept"
+            f"replaced. {advice}, and run again"
         ) from error
 
 

@@ -180,7 +180,7 @@ def test_a_source_that_vanishes_midway(reference, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("mode", "told"),
     [
-        (0o555, "locked: cannot write there (Permission denied)"),
+        (0o555, "locked (Permission denied); nothing was replaced"),
         (0o000, "s.zarr: cannot be looked at (Permission denied)"),
     ],
 )

@@ -195,7 +195,7 @@ def test_a_full_disk_before_anything_is_written_is_told(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("tempfile.mkdtemp", none_left)
-    assert "cannot write there (No space left" in refused(tmp_path / "s.zarr")
+    assert f"{tmp_path} (No space left" in refused(tmp_path / "s.zarr")
 
 
 def test_what_others_have_beside_a_store_is_refused_before_any_work(undisturbed, tmp_path):
