@@ -32,7 +32,9 @@ from slatprep.records import (
     INK,
     MATERIAL_CLASSES,
     MUTED,
+    PICTURE_FORMATS,
     PROPERTY_COLUMNS,
+    SVG_SALT,
     UNANNOTATED,
     MaterialField,
     Place,
@@ -206,6 +208,7 @@ def draw_comparison(methods: Measures, what: str, form: str) -> bytes:
 
     `what` names the kind of spread, `form` is png, svg or pdf.
     """
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     names, places = list(methods), range(len(methods))
@@ -240,5 +243,6 @@ def draw_comparison(methods: Measures, what: str, form: str) -> bytes:
         fontsize=8, color=MUTED,
     )  # fmt: skip
     drawn = BytesIO()
-    figure.savefig(drawn, dpi=120, format=form)
+    with rc_context({"svg.hashsalt": SVG_SALT}):
+        figure.savefig(drawn, dpi=120, format=form, metadata=PICTURE_FORMATS[form])
     return drawn.getvalue()

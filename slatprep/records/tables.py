@@ -72,6 +72,16 @@ UNANNOTATED_COLOUR = "#FFFFFF"
 INK, MUTED = "#1F2328", "#6B7280"
 """Colours of pictures: text and data, and everything secondary."""
 
+PICTURE_FORMATS: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+"""Formats of a picture, with the metadata to omit so that its bytes do not vary."""
+
+SVG_SALT = "slatprep"
+"""Matplotlib's ``svg.hashsalt``, without which ids within an SVG are random."""
+
 
 def _colour_beyond(index: int) -> str:
     """Return a colour for a class beyond PhysGaussian's, unlike the colours of lower ids."""

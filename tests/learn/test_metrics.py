@@ -443,6 +443,11 @@ def test_side_by_side_on_the_same_objects(case, tmp_path):
     assert lines[0].split(",")[:3] == ["method", "objects", "log10 E"]
     assert len(lines) == 1 + len(names) and all(name in done.stdout for name in names)
     assert picture.read_bytes().startswith(b"\x89PNG")
+    for drawn, time in ((tmp_path / "m.svg", b"<dc:date>"), (tmp_path / "m.pdf", b"CreationDate")):
+        run(*command, "--picture", drawn)
+        first = drawn.read_bytes()
+        run(*command, "--picture", drawn)
+        assert drawn.read_bytes() == first and time not in first
     assert "SLAT-Phys, small" in done.stdout
     assert "as large as a standard deviation" in done.stdout
     # What one writes the other prints beside.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from slatprep.records import INK as INK
 from slatprep.records import MUTED as MUTED
+from slatprep.records import PICTURE_FORMATS, SVG_SALT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +49,7 @@ STYLE: dict[str, Any] = {
     "xtick.labelsize": 7.0,
     "ytick.labelsize": 7.0,
     "figure.facecolor": PAPER,
-    "svg.hashsalt": "slatprep",  # Without it, ids within a file are random.
+    "svg.hashsalt": SVG_SALT,
     "pdf.fonttype": 42,
 }
 """Settings of matplotlib."""
@@ -61,12 +62,7 @@ def styled() -> AbstractContextManager[None]:
     return matplotlib.style.context(["default", STYLE])
 
 
-FORMATS: dict[str, dict[str, None]] = {
-    "png": {"Software": None},
-    "svg": {"Date": None},
-    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-}
-"""Formats of a picture, with the metadata to omit so that its bytes do not vary."""
+FORMATS = PICTURE_FORMATS
 
 
 def in_format(figure: Figure, kind: str = "png") -> bytes:
