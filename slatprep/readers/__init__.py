@@ -183,9 +183,8 @@ def reading_of(roots: SourceRoots) -> dict[str, str]:
     space, reading = roots.contents.latents, {}
     if roots.adapter != SourceRoots.adapter:
         reading["adapter"] = f"{roots.adapter} {made_by('slatprep.sources', roots.adapter)}"
-    if (space.channels, space.resolution) != (TRELLIS.channels, TRELLIS.resolution):
-        own = made_by("slatprep.latents", space.encoder)
-        reading["encoder"] = f"{space.encoder} {space.channels} {space.resolution} {own}"
+    if space != TRELLIS:  # Warnings of latents depend on all of it.
+        reading["encoder"] = f"{space} {made_by('slatprep.latents', space.encoder)}"
     if roots.units != Units():
         reading["units"] = f"{roots.units.youngs_modulus}, {roots.units.density}"
     if roots.plausibility != SourceRoots.plausibility:

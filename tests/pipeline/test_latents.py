@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.made_store import edit_attributes
 from support.synthetic import Dataset, MakeDataset
-from support.trees import records_beside, records_of
+from support.trees import records_beside, records_of, tree
 
 from slatprep import build_store, concat_stores, export_store, open_store
 from slatprep.errors import InputError, StoreError
@@ -19,7 +19,7 @@ from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.seen import look
 from slatprep.readers import discover, read_latents
-from slatprep.records import FEATS_MEAN, FEATS_STD, StructuredLatents
+from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, StructuredLatents
 from slatprep.store.integrity import metadata_findings
 
 MEAN, STD = np.array(FEATS_MEAN, np.float32), np.array(FEATS_STD, np.float32)
@@ -70,6 +70,19 @@ def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tm
         summary = build_store(dataset.parameters(slat={"standardised": said}), out)
         assert of_latents(summary.warnings) == []
         assert open_store(out).contents.latents.standardised == (said == "yes")
+
+
+def test_warnings_follow_what_is_said_of_latents_later(dataset, tmp_path):
+    rewrite(dataset, lambda feats: (feats - MEAN) / STD)
+    other = {name: getattr(TRELLIS, name) for name in ("channels", "resolution", "mean")}
+    path = tmp_path / "other.json"
+    path.write_text(json.dumps({**other, "encoder": "other", "std": [9.0] * 8}))
+    updated = tmp_path / "s.zarr"
+    for number, slat in enumerate(({}, {"standardised": "yes"}, {"encoder": str(path)}, {})):
+        fresh = tmp_path / f"{number}.zarr"
+        for out in (updated, fresh):
+            build_store(dataset.parameters(slat=slat), out)
+        assert tree(updated) == tree(fresh), slat
 
 
 def test_assets_too_small_to_tell_alone_tell_together(dataset, tmp_path):
