@@ -165,7 +165,7 @@ def list_assets(
     slatprep list data/demo.zarr --category tree --ids
     """
     from slatprep.inspect.overview import list_assets as listed_of
-    from slatprep.pipeline.decoys import measured_errors
+    from slatprep.pipeline.decoys import errors_of
     from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)
@@ -183,7 +183,7 @@ def list_assets(
         rows = ((a.asset_id[:length], *attrgetter(*columns)(a), why(a.reasons)) for a in listed)
         title = f"{len(listed):,} of {len(opened):,} assets"
         output.table(title, ("id", *columns, "why"), rows)
-        if listed and measured_errors(opened.path):
+        if listed and errors_of(opened):
             show_errors(opened)
         show_unusual(unusual)
 

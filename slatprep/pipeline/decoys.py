@@ -397,9 +397,17 @@ def measured_errors(store: Place) -> MeasuredErrors | None:
         return None  # The errors are measured anew.
 
 
+def errors_of(store: Store) -> MeasuredErrors | None:
+    """Return the last measurement of a store if any of the assets are still there, else None."""
+    measured = measured_errors(store.path)
+    if measured and measured.decoys and not any(one.grid in store for one in measured.decoys):
+        return None  # Another dataset lay at this place.
+    return measured
+
+
 def told_of(store: Store) -> list[str]:
     """Return sentences on what is known of a store's errors, or on why nothing is known."""
-    measured = measured_errors(store.path)
+    measured = errors_of(store)
     if measured is None:
         if reason := _no_decoys(store):
             return [f"not measured: {reason}"]

@@ -120,6 +120,11 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     file.write_text(json.dumps(json.loads(file.read_bytes()) | {"build": "another"}))
     assert told_of(store)[:-1] == measured.sentences()
     assert told_of(store)[-1].startswith("measured before the last update, when there were 5")
+    kept = json.loads(file.read_bytes())
+    gone = [{**one, "grid": f"gone-{one['grid']}"} for one in kept["decoys"]]
+    file.write_text(json.dumps(kept | {"decoys": gone}))
+    assert told_of(store)[0].startswith("not measured; ")
+    file.write_text(json.dumps(kept))
     file.write_text("{")
     assert measured_errors(store.path) is None
     assert told_of(store) == [

@@ -23,7 +23,7 @@ from slatprep.inspect.report.drawn import BINS, COLUMNS, LEVELS, PER_SHEET, VIEW
 from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
-from slatprep.pipeline.decoys import measured_errors, told_of
+from slatprep.pipeline.decoys import errors_of, told_of
 from slatprep.pipeline.notices import shared_sources
 from slatprep.pipeline.rows import slat_contents
 from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Place, Status
@@ -199,7 +199,7 @@ def page_content(
 
 def _errors(store: Store) -> dict[str, Any]:
     """Return the verdicts' error rates measured on decoys, and the histograms of scores."""
-    measured, told = measured_errors(store.path), {"told": told_of(store)}
+    measured, told = errors_of(store), {"told": told_of(store)}
     if measured is None:
         return told
     return told | {
