@@ -251,7 +251,7 @@ def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
     others = [name for name, look in looks.items() if look != latents.standardised]
     if others and standardised != "no":
         how = "as the encoder gives them" if latents.standardised else "standardised already"
-        yield (
-            f"the latents of {_of_assets(others, new.ids)} look {how}, unlike the others: look "
-            "where they come from"
-        )
+        why = "unlike the others: look where they come from"
+        if len(others) == len(looks):
+            why = f'and slat.standardised is "{standardised}": is that so?'
+        yield f"the latents of {_of_assets(others, new.ids)} look {how}, {why}"

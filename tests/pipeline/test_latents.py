@@ -72,6 +72,13 @@ def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tm
         assert open_store(out).contents.latents.standardised == (said == "yes")
 
 
+def test_all_latents_unlike_what_is_said_are_told_so(dataset, tmp_path):
+    parameters = dataset.parameters(slat={"standardised": "yes"})
+    told = of_latents(build_store(parameters, tmp_path / "s.zarr").warnings)
+    said = 'look as the encoder gives them, and slat.standardised is "yes": is that so?'
+    assert any(text.endswith(said) for text in told)
+
+
 def test_warnings_follow_what_is_said_of_latents_later(dataset, tmp_path):
     rewrite(dataset, lambda feats: (feats - MEAN) / STD)
     other = {name: getattr(TRELLIS, name) for name in ("channels", "resolution", "mean")}
