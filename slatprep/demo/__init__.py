@@ -28,6 +28,7 @@ from slatprep.demo.sources import (
     write_json,
 )
 from slatprep.errors import ConfigError
+from slatprep.workers import counted
 from slatprep.workers.local import run_unordered
 
 __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
@@ -154,11 +155,7 @@ def make_demo(
     tasks = ((root, recipe, index) for index in range(assets))
     # A single file for all assets allows only one writer.
     writers = 1 if slat_form == "hdf5-groups" else jobs
-    made = {}
-    for index, entry in run_unordered(_make_one, tasks, writers):
-        made[index] = entry
-        if progress is not None:
-            progress(len(made), assets)
+    made = dict(counted(run_unordered(_make_one, tasks, writers), assets, progress))
     entries = [made[index] for index in range(assets)]
     _write_definition(root, recipe, entries)
     write_json(root / "demo.json", {"recipe": asdict(recipe), "assets": entries})

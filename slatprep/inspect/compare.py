@@ -20,7 +20,7 @@ from slatprep.records import RESOLUTION, Place
 from slatprep.store import Store, open_store
 from slatprep.store.assets import ASSET_COLUMNS
 from slatprep.store.reader import VOXEL_COLUMNS
-from slatprep.workers import Progress
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import run_in_order
 
 _ROUNDING = 1e-6
@@ -282,10 +282,7 @@ def _changes(
         )
         for k, pair in enumerate(rows)
     )
-    for done, change in enumerate(run_in_order(_compare, tasks, jobs), 1):
-        yield change
-        if progress:
-            progress(done, len(rows))
+    yield from counted(run_in_order(_compare, tasks, jobs), len(rows), progress)
 
 
 def _unequal(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:

@@ -28,7 +28,7 @@ from slatprep.records import (
     StructuredLatents,
 )
 from slatprep.store import StoredAsset, open_store
-from slatprep.workers import Progress
+from slatprep.workers import Progress, counted
 
 SUCCESS_DISPLACEMENT = 1.5
 """Largest mean displacement [voxel] of a right placement, above that of the true similarity."""
@@ -159,11 +159,8 @@ def score_against_truth(
     if not known:
         fault = f"none of its {len(truths):,} files has the id of an asset of {store}"
         raise InputError(truth_dir, fault, f"names such as {opened.ids[0]}.npz")
-    scores = []
-    for asset_id in known:
-        scores.append(_score_asset(opened.asset(asset_id), truths[asset_id]))
-        if progress is not None:
-            progress(len(scores), len(known))
+    each = (_score_asset(opened.asset(asset_id), truths[asset_id]) for asset_id in known)
+    scores = list(counted(each, len(known), progress))
     missing = tuple(sorted(truths.keys() - known))
     return TruthReport(tuple(scores), summarise(scores), missing)
 

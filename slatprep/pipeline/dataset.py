@@ -52,7 +52,7 @@ from slatprep.store.reader import require_outside
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
 from slatprep.store.records import ASSETS
-from slatprep.workers import Progress
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import Jobs, require_shared, run_unordered, start_early
 
 __all__ = ["BuildPlan", "BuildSummary", "Progress", "align_pairs", "build_store", "plan_build"]
@@ -212,14 +212,11 @@ def finish(
         fetch_members(read, crew.note)
         compile_kernels(crew.note)  # Otherwise each worker of this machine compiles all of them.
     tasks = ((pair, plan[pair.asset_id], context) for pair in pairs)
-    assets: list[Row | FailedRecord] = []
     if crew.progress:
         crew.progress(0, len(pairs))
-    for asset in run_unordered(finish_asset, tasks, jobs, fail_asset):
-        assets.append(asset)
-        if crew.progress:
-            crew.progress(len(assets), len(pairs))
-    return assets
+    return list(
+        counted(run_unordered(finish_asset, tasks, jobs, fail_asset), len(pairs), crew.progress)
+    )
 
 
 def plan_build(

@@ -29,7 +29,7 @@ from slatprep.store import Store
 from slatprep.store.reader import require_beside
 from slatprep.store.record import StageParameters
 from slatprep.store.records import ERRORS, StoredRecords, manifests_of
-from slatprep.workers import Progress
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import Jobs, run_unordered
 
 DECOYS = 200
@@ -233,10 +233,9 @@ def measure_errors(
     missing = [number for number, one in enumerate(found) if not one.evidence][:most_new]
     source = SourceStore(store)
     tasks = ((source, k, wanted[k], source.records.of(wanted[k].grid).parameters) for k in missing)
-    for done, (number, decoy) in enumerate(run_unordered(align_decoy, tasks, jobs, fail_decoy), 1):
+    results = run_unordered(align_decoy, tasks, jobs, fail_decoy)
+    for number, decoy in counted(results, len(missing), progress):
         found[number] = decoy
-        if progress:
-            progress(done, len(missing))
     made = tuple(one for one in found if one.evidence)
     folds = [fold_of(str(one), FOLDS) for one in store.column("object_id")]
     rates = error_rates(

@@ -42,6 +42,7 @@ from slatprep.store.writer import (
     packing_of,
     shards,
 )
+from slatprep.workers import counted
 from slatprep.workers.local import Jobs, run_unordered
 
 Arrays = dict[str, NDArray[Any]]
@@ -95,12 +96,11 @@ def _made(
     todo.sort(key=lambda shard: shard.group != "grid")
     how = new.normalization, new.contents.background, new.merged
     tasks = ((here, work.spool, new.stores, shard, *how) for shard in todo)
-    for done, (shard, counts, files) in enumerate(run_unordered(write_shard, tasks, jobs), 1):
+    made = run_unordered(write_shard, tasks, jobs)
+    for shard, counts, files in counted(made, len(todo), progress):
         if shard.group in clipped:
             clipped[shard.group][shard.first : shard.first + len(shard.rows)] += counts
         written |= files
-        if progress:
-            progress(done, len(todo))
     reached("records written", path.name)
     _write_columns(path, new, {_CLIPPED[group]: counts for group, counts in clipped.items()})
     files = _take(path, new, taken)

@@ -20,7 +20,7 @@ from slatprep.storage.atomic import staged, writing
 from slatprep.storage.files import file_name
 from slatprep.store.reader import Store, StoredAsset
 from slatprep.store.records import StoredRecords
-from slatprep.workers import Progress
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import run_unordered
 
 if TYPE_CHECKING:
@@ -63,11 +63,10 @@ def write_pictures(
     source = SourceStore(store)
     tasks = ((source, one, kind, one.asset_id in on_sheet) for one in checks)
     cells: dict[str, _Cell | None] = {}
-    for done, (asset_id, picture, cell) in enumerate(run_unordered(_drawn, tasks, jobs), 1):
+    drawn = run_unordered(_drawn, tasks, jobs)
+    for asset_id, picture, cell in counted(drawn, len(checks), progress):
         _write(files[asset_id], picture)
         cells[asset_id] = cell
-        if progress is not None:
-            progress(done, len(checks))
     if not on_sheet:
         return list(files.values()), None
     _write(target / SHEET, _sheet([cell for one in checks if (cell := cells[one.asset_id])]))

@@ -29,7 +29,7 @@ from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Place, Verdict
 from slatprep.storage.atomic import staged, writing
 from slatprep.store.reader import Store
-from slatprep.workers import Progress
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import run_unordered
 
 __all__ = ["ReportSummary", "write_report"]
@@ -121,12 +121,11 @@ def write_report(
     tallies: dict[str, Tally] = {}
     categories = list(map(str, store.column("category")))
     source = SourceStore(store)
-    for one, counts in run_unordered(draw_asset, ((source, row) for row in chosen), jobs):
+    made = run_unordered(draw_asset, ((source, row) for row in chosen), jobs)
+    for one, counts in counted(made, len(chosen), progress):
         drawn.append(one)
         category = categories[one.index]
         tallies[category] = tallies[category] + counts if category in tallies else counts
-        if progress:
-            progress(len(drawn), len(chosen))
     drawn.sort(key=attrgetter("index"))
     full = sum(len(one.voxels[FULL]) for one in drawn)
     side = FULL if full <= VOXEL_BYTES else COARSE

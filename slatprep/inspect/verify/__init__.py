@@ -28,7 +28,7 @@ from slatprep.store.contract import MAX_VOXELS, Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.reader import Store, open_store
 from slatprep.store.records import found_manifests
-from slatprep.workers import Progress
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
 __all__ = ["Finding", "SourceRoots", "Verification", "verify_store"]
@@ -172,11 +172,9 @@ def verify_store(
     hashed, total = 0, len(rows)
     source, compared = SourceStore(store), roots if sources else None
     tasks = ((source, row, compared) for row in rows)
-    for done, (own, count) in enumerate(run_unordered(asset_findings, tasks, jobs), 1):
+    for own, count in counted(run_unordered(asset_findings, tasks, jobs), total, progress):
         findings |= set(own)
         hashed += count
-        if progress:
-            progress(done, total)
     if folder is not None:
         try:
             findings |= set(manifest_findings(store, folder, None if sample is None else rows))
