@@ -239,7 +239,7 @@ def write_prediction(
         )
     # The id of a file is its name, already encoded.
     path = folder / f"{file_name(unquote(asset_id))}.npz"
-    if path.exists() and not _is_prediction(path):
+    if path.exists() and not (path.is_file() and _is_prediction(path)):
         fault = "exists and is not a prediction of slatprep"
         raise InputError(path, fault, "a prediction to replace, or no file: name another --out")
     with staged(path) as file, file.open("wb") as stream:

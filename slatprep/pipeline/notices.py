@@ -252,6 +252,6 @@ def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:
     if others and standardised != "no":
         how = "as the encoder gives them" if latents.standardised else "standardised already"
         why = "unlike the others: look where they come from"
-        if len(others) == len(looks):
-            why = f'and slat.standardised is "{standardised}": is that so?'
+        if standardised == "yes" and len(others) == len(looks):
+            why = 'and slat.standardised is "yes": is that so?'
         yield f"the latents of {_of_assets(others, new.ids)} look {how}, {why}"

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError, amount
 from slatprep.geometry.voxels import shown_in_cells, voxels_at
 from slatprep.normalize import denormalize_properties
-from slatprep.records import MaterialField, Place, StructuredLatents
-from slatprep.records.tables import words_of
+from slatprep.records import MaterialField, Place, StructuredLatents, words_of
 from slatprep.storage.documents import read_document
 from slatprep.storage.place import place_of, storage_of
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
