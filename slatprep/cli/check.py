@@ -130,15 +130,15 @@ def _target(store: Place, picture: Path | None, assets: int) -> Path | None:
         return folder
     if picture == Path("none"):
         return None
-    from slatprep.inspect.pictures.canvas import FORMATS
+    from slatprep.records import PICTURE_FORMATS
 
-    allowed = "", ".pictures", *(f".{kind}" for kind in FORMATS)
+    allowed = "", ".pictures", *(f".{kind}" for kind in PICTURE_FORMATS)
     if picture.suffix.lower() not in allowed and not picture.is_dir():
         raise click.UsageError(
-            f"--picture {picture}: expected a file that ends in .{', .'.join(FORMATS)}, a folder "
-            "without a suffix or with .pictures, or the word none"
+            f"--picture {picture}: expected a file that ends in .{', .'.join(PICTURE_FORMATS)}, a "
+            "folder without a suffix or with .pictures, or the word none"
         )
-    if assets > 1 and picture.suffix.lower()[1:] in FORMATS:
+    if assets > 1 and picture.suffix.lower()[1:] in PICTURE_FORMATS:
         raise click.UsageError(f"--picture {picture} is one file; {assets} assets need a folder")
     return picture
 

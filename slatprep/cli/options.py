@@ -150,10 +150,10 @@ def _drawable(
     _context: click.Context, _parameter: click.Parameter, picture: Path | None
 ) -> Path | None:
     if picture is not None:
-        from slatprep.inspect.pictures.canvas import FORMATS
+        from slatprep.records import PICTURE_FORMATS
 
-        if picture.suffix[1:].lower() not in FORMATS:
-            raise click.BadParameter(f"{picture} ends in none of .{', .'.join(FORMATS)}")
+        if picture.suffix[1:].lower() not in PICTURE_FORMATS:
+            raise click.BadParameter(f"{picture} ends in none of .{', .'.join(PICTURE_FORMATS)}")
     return picture
 
 

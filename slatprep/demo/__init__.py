@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from slatprep.demo.sources import (
     write_json,
 )
 from slatprep.errors import ConfigError
-from slatprep.workers import counted
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import run_unordered
 
 __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
@@ -86,7 +85,7 @@ def make_demo(
     results: bool = False,
     samples: int = 1,
     jobs: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> DemoSummary:
     """Make a demo dataset.
 

@@ -42,7 +42,7 @@ from slatprep.store.writer import (
     packing_of,
     shards,
 )
-from slatprep.workers import counted
+from slatprep.workers import Progress, counted
 from slatprep.workers.local import Jobs, run_unordered
 
 Arrays = dict[str, NDArray[Any]]
@@ -60,7 +60,7 @@ def pack_store(
     place: Destination,
     new: NextStore,
     jobs: Jobs,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> frozenset[int]:
     """Write a store and put it in place; return the shards of records that were taken over.
 
@@ -75,7 +75,7 @@ def pack_store(
 
 
 def _made(
-    path: Path, new: NextStore, work: Work, jobs: Jobs, progress: Callable[[int, int], None] | None
+    path: Path, new: NextStore, work: Work, jobs: Jobs, progress: Progress | None
 ) -> tuple[Staged, frozenset[int]]:
     """Make a store; return its files that are not at `path`, and its shards of records taken over.
 

@@ -62,13 +62,10 @@ def styled() -> AbstractContextManager[None]:
     return matplotlib.style.context(["default", STYLE])
 
 
-FORMATS = PICTURE_FORMATS
-
-
 def in_format(figure: Figure, kind: str = "png") -> bytes:
-    """Return a figure as the bytes of a file in one of `FORMATS`."""
+    """Return a figure as the bytes of a file in one of `PICTURE_FORMATS`."""
     buffer = BytesIO()
-    figure.savefig(buffer, format=kind, dpi=figure.dpi, metadata=FORMATS[kind])
+    figure.savefig(buffer, format=kind, dpi=figure.dpi, metadata=PICTURE_FORMATS[kind])
     return buffer.getvalue()
 
 

@@ -16,6 +16,7 @@ from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import draw_alignment, error_picture, outlined
 from slatprep.inspect.pictures.scene import FARTHEST, Scene, scene_of, views
 from slatprep.pipeline.rows import SourceStore
+from slatprep.records import PICTURE_FORMATS
 from slatprep.storage.atomic import staged, writing
 from slatprep.storage.files import file_name
 from slatprep.store.reader import Store, StoredAsset
@@ -50,11 +51,12 @@ def write_pictures(
 ) -> tuple[list[Path], Path | None]:
     """Draw alignments as files; return the file of each asset, and the contact sheet or None.
 
-    For a single asset, `target` may be a file with a suffix of `FORMATS`. Otherwise it is a folder,
-    with a PNG per asset, named by its id. Several assets also get a sheet of the first `MOST`.
+    For a single asset, `target` may be a file with a suffix of `PICTURE_FORMATS`. Otherwise it is a
+    folder, with a PNG per asset, named by its id. Several assets also get a sheet of the first
+    `MOST`.
     """
     kind = target.suffix.lower()[1:]
-    if len(checks) == 1 and kind in canvas.FORMATS:
+    if len(checks) == 1 and kind in PICTURE_FORMATS:
         files = {checks[0].asset_id: target}
     else:
         kind = "png"
