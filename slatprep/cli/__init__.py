@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 
 from slatprep.workers.local import THREAD_VARIABLES
@@ -17,10 +16,9 @@ def main() -> None:
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
     os.environ["MPLBACKEND"] = "Agg"  # All pictures are files, and matplotlib fails at other names.
-    # Batch systems stop jobs with SIGTERM, which must clean up and exit like Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    from slatprep.cli.streams import prepare_streams
+    from slatprep.cli.process import prepare_stop, prepare_streams
 
+    prepare_stop()
     prepare_streams()
     if sys.flags.optimize > 1:
         sys.stderr.write(

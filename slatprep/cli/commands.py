@@ -11,7 +11,7 @@ import click
 
 from slatprep.cli import output
 from slatprep.cli.output import say
-from slatprep.cli.streams import OutputLostError, lost
+from slatprep.cli.process import OutputLostError, lost
 from slatprep.errors import ConfigError, SlatprepError
 
 GROUPS = {

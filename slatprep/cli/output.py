@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import is_dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 
 import click
 
-from slatprep.cli.streams import emit
+from slatprep.cli.process import emit, stop_if_asked
 from slatprep.errors import SlatprepError, in_unicode, printable
 from slatprep.storage.place import is_place, place_of, storage_of
 from slatprep.workers import Progress
@@ -146,15 +146,23 @@ class Output:
 
         The estimate uses the mean time over all finished assets, once there are two. An update
         with 0 done restarts the clock. If standard error is not a terminal, a line is printed
-        every half minute instead of a bar.
+        every half minute instead of a bar. An update raises KeyboardInterrupt if a signal asked
+        to stop, and the exception was lost.
         """
+        shown: AbstractContextManager[Progress]
         if self.verbosity < 0:
-            yield lambda done, total: None
+            shown = nullcontext(lambda done, total: None)
         elif not sys.stderr.isatty():
-            yield _progress_lines(label, unit)
+            shown = nullcontext(_progress_lines(label, unit))
         else:
-            with _progress_bar(label) as update:
-                yield update
+            shown = _progress_bar(label)
+        with shown as show:
+
+            def update(done: int, total: int) -> None:
+                stop_if_asked()
+                show(done, total)
+
+            yield update
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import sys
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from support.synthetic import Dataset
 from support.trees import tree
 
 from slatprep.cli.commands import slatprep
+from slatprep.cli.process import prepare_stop
 from slatprep.pipeline.dataset import build_store
 
 BEFORE = (
@@ -25,15 +27,15 @@ BEFORE = (
 AFTER = ("directory exchanged", "store replaced", "manifests written", "manifests published")
 
 
-def _run(step: str, number: signal.Signals, line: list[str], said: Path) -> None:
+def _run(step: str, number: signal.Signals, line: list[str], said: Path, lost: bool) -> None:
     sys.stderr = said.open("w", buffering=1)
 
     def reached(now: str, _: str) -> None:
         if now == step:
-            os.kill(os.getpid(), number)
+            with suppress(KeyboardInterrupt) if lost else nullcontext():
+                os.kill(os.getpid(), number)
 
-    for one in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(one, signal.default_int_handler)
+    prepare_stop()
     inject(pytest.MonkeyPatch(), reached)
     slatprep(line, prog_name="slatprep")
 
@@ -48,12 +50,14 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return made
 
 
-@pytest.mark.parametrize(("step", "number"), [
-    *((step, signal.SIGTERM) for step in (*BEFORE, *AFTER)),
-    ("asset begun", signal.SIGINT),
-    ("store replaced", signal.SIGINT),
+@pytest.mark.parametrize(("step", "number", "lost"), [
+    *((step, signal.SIGTERM, False) for step in (*BEFORE, *AFTER)),
+    ("asset begun", signal.SIGINT, False),
+    ("store replaced", signal.SIGINT, False),
+    # A library swallows the exception, as Python does in destructors.
+    ("asset begun", signal.SIGTERM, True),
 ])  # fmt: skip
-def test_a_signal_at_a_step(step, number, sources, tmp_path):
+def test_a_signal_at_a_step(step, number, lost, sources, tmp_path):
     folder = Path(shutil.copytree(sources.root / "stores", tmp_path / "stores"))
     out = folder / "s.zarr"
     before, there = tree(out), set(folder.iterdir())
@@ -62,7 +66,7 @@ def test_a_signal_at_a_step(step, number, sources, tmp_path):
         "build-store", "--pixieverse", str(sources.root / "pixieverse"),
         "--slat", str(sources.root / "slat"), "--ranges", "pixie", "--out", str(out),
     ]  # fmt: skip
-    how = {"target": _run, "args": (step, number, line, said)}
+    how = {"target": _run, "args": (step, number, line, said, lost)}
     forked = multiprocessing.get_context("fork").Process(**how)
     forked.start()
     forked.join()

@@ -1,10 +1,17 @@
-"""Print to standard output and standard error, even if one is closed or its disk is full."""
+"""The command's process: its standard streams, and the signals that stop it.
+
+Texts are printed even if a stream is closed or its disk is full. A command stops even if a library
+loses the KeyboardInterrupt: Python drops an exception that a signal raises within a destructor.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
+from types import FrameType
+from typing import NoReturn
 
 import click
 
@@ -15,6 +22,9 @@ _broken: dict[int, str] = {}
 
 _untold: set[int] = set()
 """File descriptors of broken streams that lost a text."""
+
+_asked: set[int] = set()
+"""Signals that asked this process to stop."""
 
 
 class OutputLostError(Exception):
@@ -68,3 +78,21 @@ def lost() -> str:
     return "; ".join(
         f"{_NAMES[number]} cannot be written to ({_broken[number]})" for number in sorted(_untold)
     )
+
+
+def prepare_stop() -> None:
+    """Stop on SIGTERM, with which batch systems stop jobs, as on Ctrl-C, if that is not ignored."""
+    signal.signal(signal.SIGTERM, _stop)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _stop)
+
+
+def stop_if_asked() -> None:
+    """Raise KeyboardInterrupt if a signal asked to stop."""
+    if _asked:
+        raise KeyboardInterrupt
+
+
+def _stop(number: int, _: FrameType | None) -> NoReturn:
+    _asked.add(number)
+    raise KeyboardInterrupt
