@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
@@ -16,8 +16,7 @@ from slatprep.cli.signature import Click, command
 from slatprep.errors import apart_from
 
 if TYPE_CHECKING:
-    from slatprep.learn.compare import Comparison
-    from slatprep.learn.metrics import Evaluation, Measure, Measures
+    from slatprep.learn.metrics import Measure
     from slatprep.learn.published import PublishedScore
     from slatprep.records import Place
 
@@ -76,7 +75,8 @@ def evaluate(
     slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
     """
     from slatprep.inspect.overview import UNKNOWN
-    from slatprep.learn.metrics import OURS, SPREADS, evaluate_store
+    from slatprep.learn.evaluate import draw_comparison, evaluate_store
+    from slatprep.learn.metrics import OURS, SPREADS
     from slatprep.learn.predictions import predictions_of
     from slatprep.learn.published import TABLES, read_scores
 
@@ -89,47 +89,29 @@ def evaluate(
     published = {
         name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
     }
-    part = None if split == "all" else split
     filters, left_out = _selected(output, predictions, store, split, splits)
-    chosen = filters | {"spread": spread}
-    result: Evaluation | Comparison
-    baselines: Measures = {}
-    if grids:
-        from slatprep.learn.compare import compare_methods
-
-        result = compare_methods(predictions, folders, store, part, **chosen)
-        measures = ours = result.methods
-        what = "method"
-        if result.problems:
-            output.note(
-                "note:    assets without a usable prediction of some method, left out of all: "
-                f"{len(result.problems)}"
-            )
-        if result.partly_annotated:
-            output.note(
-                "note:    objects with occupied voxels that have no annotation and are not scored: "
-                f"{result.partly_annotated}; Pixie's loader leaves such objects out"
-            )
-    else:
-        result = evaluate_store(cast("Path", predictions), store, part, **chosen)
-        baselines = result.baselines
-        others = {UNKNOWN, "all", *baselines}
-        measures = {apart_from(n, others) or UNKNOWN: m for n, m in result.categories.items()}
-        measures |= {"all": result.overall}
-        ours, what = {OURS: result.overall}, "category"
-        if result.converted:
-            output.note(
-                "note:    predictions normalised by other ranges, converted to the store's: "
-                f"{result.converted}"
-            )
+    result = evaluate_store(predictions, store, spread=spread, grids=folders, **filters)
+    measures, what = result.methods, "method"
+    if not grids:
+        groups, others = result.categories.items(), {UNKNOWN, "all", *result.baselines}
+        measures = {apart_from(name, others) or UNKNOWN: own[OURS] for name, own in groups}
+        measures["all"], what = result.methods[OURS], "category"
+    if result.partly_annotated:
+        output.note(
+            "note:    objects with occupied voxels that have no annotation and are not scored: "
+            f"{result.partly_annotated}; Pixie's loader leaves such objects out"
+        )
+    if result.converted:
+        output.note(
+            "note:    predictions normalised by other ranges, converted to the store's: "
+            f"{result.converted}"
+        )
     if result.classless:
         some = f"{', '.join(result.classless[:3])} ({len(result.classless)} in all; --json)"
         output.note(f"note:    predictions without a class, not in the accuracy: {some}")
     if csv_file is not None:
         _write_scores(csv_file, what, measures, spread)
     if picture is not None:
-        from slatprep.learn.compare import draw_comparison
-
         options.draw_to(output, picture, partial(draw_comparison, measures, SPREADS[spread]))
 
     output.problems(result.problems, "--json lists them")
@@ -143,7 +125,7 @@ def evaluate(
             "Mean squared error in normalised space, class accuracy "
             f"(± {SPREADS[spread]} over n objects)",
             (what, "n", *names),
-            [_row_of_scores(name, one) for name, one in (measures | baselines).items()],
+            [_row_of_scores(name, one) for name, one in (measures | result.baselines).items()],
         )
         if TABLES.keys() & published:
             output.note(
@@ -151,7 +133,7 @@ def evaluate(
                 "with predictions of the same objects, normalised by Pixie's ranges (--ranges "
                 "pixie)"
             )
-        means = {name: one.means for name, one in ours.items()}
+        means = {name: one.means for name, one in result.methods.items()}
         for name, scores in published.items():
             title = TABLES[name][0] if name in TABLES else name
             _show_beside(output, f"Beside {title}", means, scores)
@@ -185,7 +167,7 @@ def _selected(
     verdicts = filters.get("verdicts") or tuple(Verdict)
     others = f"above the ambiguity {filters.get('max_ambiguity')}"
     left_out = options.note_left_out(output, opened, without, verdicts, how, others)
-    return {"splits": of_object, **filters}, left_out
+    return {"split": part, "splits": of_object, **filters}, left_out
 
 
 def _folders_of_grids(grids: tuple[str, ...]) -> dict[str, Path]:

@@ -1,22 +1,30 @@
-"""Compare methods on the same objects, at SLAT voxels and on PixieVerse grids."""
+"""Measure predictions of SLAT voxels and predicted grids, side by side on the same objects."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, amount
 from slatprep.geometry.voxels import voxels_of
-from slatprep.learn.metrics import METRICS, OURS, Measures, Spread, average_methods, score_asset
+from slatprep.learn.metrics import (
+    COLUMNS,
+    METRICS,
+    OURS,
+    Measures,
+    Spread,
+    average_methods,
+    fit_baselines,
+    score_asset,
+)
 from slatprep.learn.predictions import (
-    ReadAsset,
     VoxelPrediction,
     check_prediction,
     open_predictions,
@@ -57,43 +65,52 @@ _GRIDS = (*PixieverseSource.grid, "{id}.npy")
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Scores of several methods over the same objects.
+class Evaluation:
+    """Scores of predictions, of predicted grids and of the reference models, on the same objects.
 
     Attributes
     ----------
     spread : str
         The kind of `Measure.spreads`, one of `slatprep.learn.metrics.SPREADS`.
     methods : dict of str to Measure
-        Scores over all objects, by the method's name.
+        Scores over all objects by the method's name: `OURS`, and two of each folder of grids.
+    baselines : dict of str to Measure
+        The reference models on the same assets, see `fit_baselines`; empty if the split train has
+        no object.
     categories : dict of str to dict of str to Measure
-        Scores by category, then by method.
-    partly_annotated : int
-        Objects with occupied voxels that are not annotated and so not scored. Pixie's loader
-        leaves such objects out.
+        Scores by category, then by the name of a method or reference model.
+    missing : list of str
+        Assets of the split without a prediction for SLAT voxels; they are not in the scores.
+    problems : list of str
+        Why assets of the split are not in the scores: a method has no prediction, or a bad one.
     classless : list of str
         Assets whose prediction for SLAT voxels has no class; they are not in its accuracy.
-    problems : list of str
-        Why assets of the split were left out of the scores of all methods.
+    converted : int
+        Assets whose prediction was normalised by other ranges and was converted to the store's.
+    partly_annotated : int
+        If grids are measured, objects with occupied voxels that are not annotated and so not
+        scored. Pixie's loader leaves such objects out.
     """
 
     spread: Spread
     methods: Measures
+    baselines: Measures
     categories: dict[str, Measures]
-    partly_annotated: int
-    classless: list[str]
+    missing: list[str]
     problems: list[str]
+    classless: list[str]
+    converted: int
+    partly_annotated: int
 
 
-def compare_methods(
+def evaluate_store(
     predictions: Path | None,
-    grids: Mapping[str, Path],
     store_path: Place,
     split: Split | None = "test",
-    *,
     spread: Spread = "se",
+    grids: Mapping[str, Path] | None = None,
     **filters: Any,
-) -> Comparison:
+) -> Evaluation:
     """Measure predictions of SLAT voxels and predicted grids against a store.
 
     A grid is measured twice. Its own voxels are measured by Pixie's protocol (vlongle/pixie,
@@ -106,45 +123,55 @@ def compare_methods(
     `predictions` is read by `slatprep.learn.predictions.open_predictions`, a file of `grids` by
     `slatprep.readers.pixieverse.read_prediction`: ``<object id>/sample_<k>_pred.npy``, ``<object
     id>/sample_<k>/material_grid.npy`` or ``<object id>.npy``. Split and filters are those of
-    `slatprep.learn.splits.select_assets`. InputError if no asset has a usable prediction of every
-    method; ConfigError if the store holds other properties or classes.
+    `slatprep.learn.splits.select_assets`. An asset without a usable prediction of every method is
+    left out of all and named. InputError if none is left; ConfigError if grids are given and the
+    store holds other properties or classes.
     """
-    store = open_store(store_path)
-    _require_pixieverse(store)
-    object_ids = store.column("object_id")
+    store, grids = open_store(store_path), grids or {}
+    if grids:
+        _require_pixieverse(store)
     found = {name: find_grids(PixieverseSource(root, _GRIDS)) for name, root in grids.items()}
-    names = [OURS] if predictions else []
-    names += [f"{name}, {where}" for name in grids for where in ("SLAT voxels", "own grid")]
+    trained = select_assets(store, "train", **filters).tolist()
+    baselines = fit_baselines(store, trained) if trained else ()
     scored: dict[int, list[NDArray[np.float64]]] = {}
     partly: set[str] = set()
-    problems: list[str] = []
+    missing: list[str] = []
+    bad: list[str] = []
     classless: list[str] = []
+    converted = 0
     with open_predictions(predictions) if predictions else nullcontext() as read:
         for index in select_assets(store, split, **filters).tolist():
-            object_id = str(object_ids[index])
-            truth = _Truth(store, index)
+            truth = _Truth(store, index, bool(grids))
             try:
-                ours = _ours(predictions, read, truth) if read else None
-                rows = [score_asset(ours, truth.voxels)] if ours else []
+                arrays = read(truth.asset_id) if read else {}
+                if arrays is None:
+                    missing.append(truth.asset_id)
+                    continue
+                ours = truth.checked(predictions, arrays) if predictions else None
+                rows = [truth.score(ours)] if ours else []
                 for name, root in grids.items():
-                    rows += truth.score_grid(root, found[name].get(object_id, []), object_id)
+                    rows += truth.score_grid(root, found[name].get(truth.object_id, []))
             except InputError as error:
-                problems.append(str(error))
+                bad.append(str(error))
                 continue
-            scored[index] = rows
-            if ours and ours.material is None:
-                classless.append(truth.asset_id)
-            if (truth.grid == UNANNOTATED).any():
-                partly.add(object_id)
+            scored[index] = [*rows, *(truth.score(one.predict(truth.voxels)) for one in baselines)]
+            if ours:
+                converted += ours.converted
+                if ours.material is None and store.contents.classes:
+                    classless.append(truth.asset_id)
+            if grids and (truth.grid == UNANNOTATED).any():
+                partly.add(truth.object_id)
     if not scored:
-        raise InputError(
-            predictions or next(iter(grids.values())),
-            f"no asset of split {split or 'all'} has a prediction of every method "
-            f"({problems[0] if problems else 'the split is empty'})",
-            "predictions of the same objects",
-        )
-    means = average_methods(store, scored, names, spread)
-    return Comparison(spread, *means, len(partly), classless, problems)
+        _fail(predictions, grids, split, missing, bad)
+    names = [OURS] if predictions else []
+    names += [f"{name}, {where}" for name in grids for where in ("SLAT voxels", "own grid")]
+    names += [one.name for one in baselines]
+    methods, groups = average_methods(store, scored, names, spread)
+    beside = {one.name: methods.pop(one.name) for one in baselines}
+    problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
+    return Evaluation(
+        spread, methods, beside, groups, missing, problems, classless, converted, len(partly)
+    )
 
 
 def _require_pixieverse(store: Store) -> None:
@@ -157,19 +184,31 @@ def _require_pixieverse(store: Store) -> None:
 
 
 class _Truth:
-    """The labels of an asset at its SLAT voxels and on its grid."""
+    """The labels of an asset at its SLAT voxels, and on its grid."""
 
-    def __init__(self, store: Store, index: int) -> None:
+    def __init__(self, store: Store, index: int, with_grid: bool) -> None:
         self.store, self.index, self.asset_id = store, index, store.ids[index]
-        columns = ("coords", "properties", "material", "valid", "place")
-        self.voxels = store.read(index, columns)
-        self.grid = np.asarray(store.read_rows("grid/material", index, index + 1)[0])
+        self.object_id = str(store.column("object_id")[index])
+        self.voxels = store.read(index, (*COLUMNS, "place") if with_grid else COLUMNS)
+        if with_grid:
+            self.grid = np.asarray(store.read_rows("grid/material", index, index + 1)[0])
 
-    def score_grid(
-        self, root: Path, found: Sequence[FoundField], object_id: str
-    ) -> Iterator[NDArray[np.float64]]:
+    def checked(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> VoxelPrediction:
+        """Return a usable prediction for the SLAT's voxels; raise as `check_prediction` does."""
+        coords, labelled = self.voxels["coords"], self.voxels["valid"]
+        ranges, contents = self.store.normalization, self.store.contents
+        source = f"{path}/{self.asset_id}"
+        return check_prediction(source, arrays, coords, ranges, contents, labelled)
+
+    def score(self, prediction: VoxelPrediction) -> NDArray[np.float64]:
+        """Return the metrics of a prediction for the SLAT's voxels."""
+        if not self.store.contents.classes:
+            prediction = replace(prediction, material=None)
+        return score_asset(prediction, self.voxels)
+
+    def score_grid(self, root: Path, found: Sequence[FoundField]) -> Iterator[NDArray[np.float64]]:
         """Yield the metrics of a predicted grid at the SLAT's voxels, and on the grid itself."""
-        path = one_grid(root, found, object_id, _GRIDS)
+        path = one_grid(root, found, self.object_id, _GRIDS)
         annotated = self.grid < BACKGROUND
         ranges = self.store.normalization
         properties, material = read_prediction(path, root, annotated, ranges)
@@ -184,23 +223,34 @@ class _Truth:
         looked_up = sample(field, self.voxels["place"], self.store.about.build.parameters.sample)
         values = np.where(self.voxels["valid"][:, None], looked_up.properties, 0.0)
         looked_up_classes = looked_up.material.astype(np.int64)
-        yield score_asset(
-            VoxelPrediction(values.astype(np.float64), looked_up_classes), self.voxels
-        )
+        yield self.score(VoxelPrediction(values.astype(np.float64), looked_up_classes))
         stored = np.asarray(self.store.read_rows("grid/properties", self.index, self.index + 1)[0])
         own = {"properties": stored[:, annotated].T, "material": self.grid[annotated]}
         own["valid"] = np.ones(len(properties), dtype=bool)
         yield score_asset(VoxelPrediction(properties, material.astype(np.int64)), own)
 
 
-def _ours(predictions: Path | None, read: ReadAsset, truth: _Truth) -> VoxelPrediction:
-    arrays = read(truth.asset_id)
-    if arrays is None:
-        raise InputError(predictions, f"no prediction of {truth.asset_id}", "one of every asset")
-    source = f"{predictions}/{truth.asset_id}"
-    ranges, contents = truth.store.normalization, truth.store.contents
-    coords, labelled = truth.voxels["coords"], truth.voxels["valid"]
-    return check_prediction(source, arrays, coords, ranges, contents, labelled)
+def _fail(
+    predictions: Path | None,
+    grids: Mapping[str, Path],
+    split: Split | None,
+    missing: Sequence[str],
+    bad: Sequence[str],
+) -> NoReturn:
+    """Raise InputError, as no asset can be scored."""
+    where = f"of an asset of split {split or 'all'}"
+    place = predictions or next(iter(grids.values()))
+    if bad:
+        raise InputError(
+            place,
+            f"has {amount(len(bad), 'prediction')} {where}, and none can be used ({bad[0]})",
+            "normalised properties of every voxel",
+        )
+    raise InputError(
+        place,
+        f"has no prediction {where}",
+        f"ids of that split, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
+    )
 
 
 def draw_comparison(methods: Measures, what: str, form: str) -> bytes:

@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, amount
 from slatprep.geometry.frames import voxel_centres
-from slatprep.learn.predictions import VoxelPrediction, check_prediction, open_predictions
-from slatprep.learn.splits import select_assets
-from slatprep.readers.splits import Split
-from slatprep.records import Normalization, Place
-from slatprep.store import Store, open_store
+from slatprep.learn.predictions import VoxelPrediction
+from slatprep.records import Normalization
+from slatprep.store import Store
 
 METRICS = ("log10 E", "log10 density", "nu", "mean", "accuracy")
 """Mean squared errors in normalised space, their mean, and class accuracy.
@@ -80,42 +76,6 @@ class Measure:
     objects: int
     means: dict[str, float]
     spreads: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Scores of predictions.
-
-    Attributes
-    ----------
-    spread : str
-        The kind of `Measure.spreads`, see `SPREADS`.
-    overall : Measure
-        Scores over all objects.
-    categories : dict of str to Measure
-        Scores over the objects of each category.
-    missing : list of str
-        Assets of the split without a prediction; they are not in the scores.
-    problems : list of str
-        Why assets of the split are not in the scores: they have no prediction, or a bad one.
-    classless : list of str
-        Assets whose prediction has no class; they are not in the accuracy.
-    converted : int
-        Assets whose prediction was normalised by other ranges and was converted to the
-        store's.
-    baselines : dict of str to Measure
-        The reference models on the same assets, see `fit_baselines`; empty if the
-        split train has no object.
-    """
-
-    spread: Spread
-    overall: Measure
-    categories: dict[str, Measure]
-    missing: list[str]
-    problems: list[str]
-    classless: list[str] = field(default_factory=list)
-    converted: int = 0
-    baselines: dict[str, Measure] = field(default_factory=dict)
 
 
 def score_asset(prediction: VoxelPrediction, truth: Rows) -> NDArray[np.float64]:
@@ -185,70 +145,6 @@ def average_methods(
 
     groups = {str(name): measures(category == name) for name in np.unique(category)}
     return measures(np.ones(len(first), dtype=bool)), groups
-
-
-def evaluate_store(
-    predictions: Path,
-    store_path: Place,
-    split: Split | None = "test",
-    spread: Spread = "se",
-    **filters: Any,
-) -> Evaluation:
-    """Measure predictions, as `open_predictions` reads them, against a store.
-
-    `slatprep.learn.splits.select_assets` takes split and filters. Predictions that cannot
-    be used are left out and named. InputError if no asset of the split has one that can be used.
-    """
-    store = open_store(store_path)
-    scored: dict[int, list[NDArray[np.float64]]] = {}
-    missing: list[str] = []
-    bad: list[str] = []
-    classless: list[str] = []
-    converted = 0
-    trained = select_assets(store, "train", **filters).tolist()
-    baselines = fit_baselines(store, trained) if trained else ()
-    with open_predictions(predictions) as read:
-        for index in select_assets(store, split, **filters).tolist():
-            asset_id = store.ids[index]
-            source, ranges = f"{predictions}/{asset_id}", store.normalization
-            try:
-                arrays = read(asset_id)
-                if arrays is None:
-                    missing.append(asset_id)
-                    continue
-                rows = store.read(index, COLUMNS)
-                coords, labelled = rows["coords"], rows["valid"]
-                prediction = check_prediction(
-                    source, arrays, coords, ranges, store.contents, labelled
-                )
-            except InputError as error:
-                bad.append(str(error))
-                continue
-            converted += prediction.converted
-            methods = [prediction, *(one.predict(rows) for one in baselines)]
-            if not store.contents.classes:
-                methods = [replace(one, material=None) for one in methods]
-            elif prediction.material is None:
-                classless.append(asset_id)
-            scored[index] = [score_asset(one, rows) for one in methods]
-    if not scored:
-        where = f"of an asset of split {split or 'all'}"
-        if bad:
-            raise InputError(
-                predictions,
-                f"has {amount(len(bad), 'prediction')} {where}, and none can be used ({bad[0]})",
-                "normalised properties of every voxel",
-            )
-        raise InputError(
-            predictions,
-            f"has no prediction {where}",
-            f"ids of that split, such as {', '.join(missing[:3]) or 'none: the split is empty'}",
-        )
-    names = [OURS, *(one.name for one in baselines)]
-    beside, groups = average_methods(store, scored, names, spread)
-    overall, categories = beside.pop(OURS), {name: own[OURS] for name, own in groups.items()}
-    problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
-    return Evaluation(spread, overall, categories, missing, problems, classless, converted, beside)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from support.synthetic import JELLY, METAL, QUARTER_TURN, MakeDataset
 from slatprep.errors import ConfigError, StoreError
 from slatprep.export import ExportOptions, export_store
 from slatprep.export.ply import VERTEX, write_points
-from slatprep.learn.metrics import evaluate_store
+from slatprep.learn.evaluate import evaluate_store
+from slatprep.learn.metrics import OURS
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import MATERIAL_CLASSES
 from slatprep.store import open_store
@@ -85,7 +86,7 @@ def test_exported_labels_are_right_in_a_store_of_other_ranges(form, make_dataset
     said = out / "latents" / ENCODER if form == "npz" else out
     report = evaluate_store(said, tmp_path / "second.zarr", None)
     assert report.converted == 1
-    assert report.overall.means["mean"] == pytest.approx(0.0, abs=1e-9)
+    assert report.methods[OURS].means["mean"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_names_that_pandas_takes_for_numbers_or_nothing_are_found(copy, tmp_path):

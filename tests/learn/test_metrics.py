@@ -22,8 +22,8 @@ from support.predictions import right, write_one, write_predictions, zeros
 from support.synthetic import Dataset
 
 from slatprep import InputError, open_store
-from slatprep.learn.compare import Comparison, compare_methods
-from slatprep.learn.metrics import METRICS, OURS, average_methods, evaluate_store
+from slatprep.learn.evaluate import Evaluation, evaluate_store
+from slatprep.learn.metrics import METRICS, OURS, average_methods
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
 from slatprep.learn.splits import assign_store
 from slatprep.normalize import PIXIE_RANGES
@@ -84,11 +84,11 @@ def test_against_a_plain_computation(learn_store, predicted, form):
             row = [*means, means.mean(), right[valid[here]].mean()]
             by_object.setdefault(str(objects[k]), []).append(row)
     rows = [np.mean(views, axis=0) for views in by_object.values()]
-    result = evaluate_store(predicted[form], learn_store, None, spread="se")
-    assert result.overall.objects == 8
-    assert list(result.overall.means.values()) == pytest.approx(np.mean(rows, axis=0).tolist())
+    ours = evaluate_store(predicted[form], learn_store, None, spread="se").methods[OURS]
+    assert ours.objects == 8
+    assert list(ours.means.values()) == pytest.approx(np.mean(rows, axis=0).tolist())
     error = np.std(rows, axis=0, ddof=1) / np.sqrt(8)
-    assert list(result.overall.spreads.values()) == pytest.approx(error.tolist())
+    assert list(ours.spreads.values()) == pytest.approx(error.tolist())
 
 
 def write_changed(
@@ -112,7 +112,7 @@ def test_only_labelled_voxels_of_a_prediction_count(learn_store, tmp_path, form)
         return arrays | {"coords": coords, "valid": truth["valid"], "resolution": np.array(64)}
 
     folder = write_changed(tmp_path / "p.h5", learn_store, change, form)
-    means = evaluate_store(folder, learn_store, None).overall.means
+    means = evaluate_store(folder, learn_store, None).methods[OURS].means
     assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
@@ -124,7 +124,7 @@ def test_without_classes_nothing_has_an_accuracy(learn_store, tmp_path):
     folder = write_changed(tmp_path / "p", store, lambda _, arrays, truth: arrays)
     result = evaluate_store(folder, store, None)
     assert len(result.baselines) == 2
-    for scores in (result.overall, *result.baselines.values()):
+    for scores in (result.methods[OURS], *result.baselines.values()):
         assert math.isnan(scores.means["accuracy"]) and math.isfinite(scores.means["nu"])
 
 
@@ -190,7 +190,7 @@ def test_equal_scores_are_no_class(learn_store, tmp_path):
         valid = store.read(row, ("valid",))["valid"]
         by_object.setdefault(name, []).append((np.flatnonzero(valid) % 2).mean())
     expected = np.mean([np.mean(views) for views in by_object.values()])
-    assert result.overall.means["accuracy"] == pytest.approx(expected)
+    assert result.methods[OURS].means["accuracy"] == pytest.approx(expected)
 
 
 def test_accuracy_is_of_the_predictions_with_classes(learn_store, tmp_path):
@@ -207,8 +207,7 @@ def test_accuracy_is_of_the_predictions_with_classes(learn_store, tmp_path):
     )
     told = document(*words)
     assert told["classless"] == [first]
-    assert told["overall"]["means"]["accuracy"] == 1.0
-    assert compare_methods(folder, {}, learn_store, None).classless == [first]
+    assert told["methods"][OURS]["means"]["accuracy"] == 1.0
 
 
 def test_published_rows_agree_with_themselves_and_what_is_printed():
@@ -227,8 +226,9 @@ def test_command(learn_store, predicted, tmp_path):
     (some / "a.npz").unlink()
     words = ("evaluate", some, "--store", learn_store, "--split", "all")
     told = document(*words, "--csv", own, code=1)
-    means = told["overall"]["means"]
-    assert (told["missing"], told["overall"]["objects"], list(means)) == (["a"], 7, list(METRICS))
+    means = told["methods"][OURS]["means"]
+    assert (told["missing"], told["methods"][OURS]["objects"]) == (["a"], 7)
+    assert list(means) == list(METRICS)
     last = own.read_text().splitlines()[-1].split(",")
     assert last[:2] == ["all", "7"] and float(last[2]) == pytest.approx(means["log10 E"])
     shown = run(*words, "--beside", "pixie", "--beside", own, code=1)
@@ -251,7 +251,7 @@ def test_bad_predictions_are_named_and_the_others_measured(learn_store, predicte
     (some / "e.npz").unlink()
     words = ("evaluate", some, "--store", learn_store, "--split", "all")
     told = document(*words, code=1)
-    assert (told["overall"]["objects"], told["missing"], told["ok"]) == (4, ["e"], False)
+    assert (told["methods"][OURS]["objects"], told["missing"], told["ok"]) == (4, ["e"], False)
     shown = run(*words, code=1)
     reasons = "no prediction of e", "has shape", "not all finite", "reach 7850"
     for reason, problem in zip(reasons, told["problems"], strict=True):
@@ -342,10 +342,10 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     return Case(parameters, store, grids, predicted, folder / "eleven")
 
 
-def compared(case: Case, root: Path | None = None, **others: Any) -> Comparison:
+def compared(case: Case, root: Path | None = None, **others: Any) -> Evaluation:
     splits = assign_store(open_store(case.store)).splits
     grids = {"m": root or case.results}
-    return compare_methods(None, grids, case.store, None, splits=splits, **others)
+    return evaluate_store(None, case.store, None, grids=grids, splits=splits, **others)
 
 
 def pixie_s_scores(truth: np.ndarray, predicted: np.ndarray) -> list[float]:

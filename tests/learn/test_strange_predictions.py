@@ -19,7 +19,8 @@ from support.predictions import right, write_one, write_predictions, zeros
 
 from slatprep.errors import InputError
 from slatprep.learn.decoder import make_decoder
-from slatprep.learn.metrics import evaluate_store
+from slatprep.learn.evaluate import evaluate_store
+from slatprep.learn.metrics import OURS
 from slatprep.learn.predict import checkpoint_state, load_checkpoint
 from slatprep.learn.predictions import check_prediction, open_predictions, selection_of_run
 from slatprep.learn.runs import LAST
@@ -119,7 +120,7 @@ def test_zarr_predictions_of_any_cut_are_read(learn_store, tmp_path):
         how = cuts[row % 5] | {"shape": values.shape, "dtype": "f4", "config": whole}
         group.create_array("properties", **how)[:] = values
         group.create_array("material", data=arrays["material"], config=whole)
-    means = evaluate_store(tmp_path / "p.zarr", learn_store, None).overall.means
+    means = evaluate_store(tmp_path / "p.zarr", learn_store, None).methods[OURS].means
     assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 

@@ -382,7 +382,7 @@ def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, tmp_path):
 
     words = ("evaluate", out / "predictions", "--store", learn_store, "--json")
     measured = run(*words)
-    assert json.loads(measured.stdout)["overall"]["objects"] == 2
+    assert json.loads(measured.stdout)["methods"]["these predictions"]["objects"] == 2
     assert f"as {out / 'run.json'} says: 3 train, 1 val, 2 test" in measured.stderr
     assert run(*words, "--split-by", out / "splits.json").stdout == measured.stdout
 
@@ -398,7 +398,7 @@ def test_evaluate_outside_a_run_says_which_split_it_takes(learn_store, tmp_path)
     assert "--split all" in bare and "--split-by" in bare
     chosen = run(*command, "--split-by", "pixie", "--json")
     assert "by pixie: " in chosen.stderr and "no run" not in chosen.stderr
-    assert json.loads(chosen.stdout)["overall"]["objects"] == 1
+    assert json.loads(chosen.stdout)["methods"]["these predictions"]["objects"] == 1
 
 
 @pytest.mark.parametrize("steps", [1, 3, 4])

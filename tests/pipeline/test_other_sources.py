@@ -20,8 +20,8 @@ from slatprep.inspect.check import check_alignment
 from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.inspect.report.drawn import SHADES, thumbnail
 from slatprep.inspect.verify import verify_store
-from slatprep.learn.compare import compare_methods
-from slatprep.learn.metrics import evaluate_store
+from slatprep.learn.evaluate import evaluate_store
+from slatprep.learn.metrics import OURS
 from slatprep.learn.predictions import open_predictions
 from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import (
@@ -141,7 +141,7 @@ def test_without_classes_no_accuracy_is_claimed(tmp_path):
     summary = train(out, trained, TrainParameters(size="small", epochs=1, precision="fp32"))
     assert np.isnan(summary.history[-1].val_accuracy)
     assert np.isfinite(summary.history[-1].val_loss)
-    means = evaluate_store(trained / "predictions", out, split=None).overall.means
+    means = evaluate_store(trained / "predictions", out, split=None).methods[OURS].means
     assert np.isnan(means["accuracy"]) and np.isfinite(means["mean"])
 
 
@@ -297,7 +297,7 @@ def test_pixie_s_grids_are_not_measured_against_other_properties(tmp_path):
     write(tmp_path, "a")
     build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
     with pytest.raises(ConfigError, match="holds density, yield_stress, friction_angle"):
-        compare_methods(None, {"m": tmp_path / "slat"}, tmp_path / "s.zarr", None, splits={})
+        evaluate_store(None, tmp_path / "s.zarr", None, grids={"m": tmp_path / "slat"}, splits={})
 
 
 def test_properties_next_to_the_border_of_two_labels_are_verified(tmp_path):
@@ -377,7 +377,7 @@ def test_nine_classes_and_other_properties_go_all_the_way_to_scores(tmp_path):
         shown = {(index - 1) // SHADES for index in np.unique(thumbnail(asset)) if index}
         assert shown <= set(asset.material.tolist()) and shown & {7, 8}
     train(out, trained, TrainParameters(size="small", epochs=1, precision="fp32"))
-    means = evaluate_store(trained / "predictions", out, split=None).overall.means
+    means = evaluate_store(trained / "predictions", out, split=None).methods[OURS].means
     assert tuple(means) == ("log10 density", "hardness", "mean", "accuracy")
     assert np.isfinite(means["accuracy"])
     with np.load(next((trained / "predictions").glob("*.npz"))) as file:
