@@ -33,12 +33,10 @@ from slatprep.align.finish import as_free, finish, rank_of
 from slatprep.align.ground import GROUND_GAIN, LEAST_ABOVE, RAISED, find_layers, gain, raised
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import (
-    COARSE_SAMPLES,
-    COARSE_TAUS,
+    COARSE,
     DISTINCT,
     MOST_SURVIVORS,
-    POLISH_SAMPLES,
-    POLISH_TAUS,
+    POLISH,
     TIE,
     Pair,
 )
@@ -125,7 +123,7 @@ def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignme
 
 def _search(pair: Pair) -> Candidates:
     starts = pair.starts((s.rotation for s in distinct_starts()), pair.size_ratio)
-    fits = pair.refine(starts, COARSE_SAMPLES, COARSE_TAUS, 0.02)
+    fits = pair.refine(starts, COARSE)
     poses = pair.polish(fits)
     wide: list[Pose] = []
     halfway: list[Pose] = []
@@ -209,7 +207,7 @@ def fitted_near(
     starts = [
         pose for scale in sorted({pair.size_ratio, 1.0}) for pose in pair.starts([rotation], scale)
     ]
-    poses = pair.polish(pair.refine(starts, COARSE_SAMPLES, COARSE_TAUS, 0.02))
+    poses = pair.polish(pair.refine(starts, COARSE))
     (best, *_), deformed = finish(pair, poses[:1], rough=poses[0].score < CLEAN)
     own, figures = Similarity.of(alignment.transform), alignment.figures
     figures = figures or measure_figures(field, latents, alignment)
@@ -238,9 +236,9 @@ def lead_of_another(
     given = Pose(Similarity.of(transform))
     less, more = sorted((1.0 - quality.fitness, 1.0 - quality.fitness_backward))
     better = BETTER if less > 0.5 * more else 1.0
-    (own,) = pair.refine([given], POLISH_SAMPLES, POLISH_TAUS, 0.01)
+    (own,) = pair.refine([given], POLISH)
     if pair.apart([own], given)[0] >= DISTINCT:
-        near, (own,) = own, pair.refine([given], POLISH_SAMPLES, (), 0.0)
+        near, (own,) = own, pair.refine([given], POLISH._replace(taus=()))
         if better < 1.0 and near.score > 0.5 * (1.0 + own.score):
             return near.score - own.score
     least = max(POOR, own.score + min(BEATEN, better * (1.0 - own.score)))

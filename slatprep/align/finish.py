@@ -13,8 +13,7 @@ import numpy as np
 from slatprep.align.agreement import blocks_of
 from slatprep.align.deform import Deformed, deform_if_earned
 from slatprep.align.pair import (
-    FINE_SAMPLES,
-    FINE_TAUS,
+    FINE,
     RANK_SAMPLES,
     RANK_STANDING,
     TIE,
@@ -43,12 +42,12 @@ second, or it is set to one."""
 
 
 def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], Deformed]:
-    """Refine poses on `FINE_SAMPLES`, and deform the best one if that is earned.
+    """Refine poses by `FINE` steps, and deform the best one if that is earned.
 
     If it is deformed or the sides are rough, deform the next ones too, and order all by their
     scores after that. Return the poses, best first, and the fit of the best one.
     """
-    fine = pair.refine(poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=rough)
+    fine = pair.refine(poses, FINE, size_by_slat=rough)
     first, *others = pair.distinct(fine)
     best, deformed = _deformed(pair, first, rough)
     if deformed.deformation is None and not (rough and pair.may_deform):
@@ -144,9 +143,7 @@ def _simplest(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Model]:
         return pose, Model(model)
     if abs(pose.similarity.scale - 1.0) < RIGID_IF_SCALE_WITHIN:
         start = replace(pose, similarity=pair.at_scale_one(pose.similarity))
-        (rigid,) = pair.refine(
-            [start], FINE_SAMPLES, FINE_TAUS, 0.002, free_scale=False, size_by_slat=rough
-        )
+        (rigid,) = pair.refine([start], FINE, free_scale=False, size_by_slat=rough)
         if rigid.score >= pose.score - RIGID_LOSS:
             return rigid, Model.RIGID
     return pose, Model.SIMILARITY

@@ -12,17 +12,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from slatprep.align.deform import try_out
-from slatprep.align.pair import POLISH_SAMPLES, Pair
+from slatprep.align.pair import POLISH, Pair, Steps
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.starts import distinct_starts, so3_starts
 from slatprep.records import MIRRORED
 
-REFLECTED_SAMPLES, REFLECTED_TAUS = 60, (3.0, 2.0, 1.0, 1.0)
-WIDE_SAMPLES, WIDE_TAUS, WIDE_STARTS, WIDE_KEPT = 60, (8.0, 5.0, 3.0, 2.0), 240, 6
-NEXT_SAMPLES, NEXT_TAUS, NEXT_KEPT = 200, (2.0, 1.0, 1.0, 1.0), 2
-LAST_TAUS = (1.0, 1.0, 1.0)
+REFLECTED = Steps(60, (3.0, 2.0, 1.0, 1.0), 0.02)
+WIDE, WIDE_STARTS, WIDE_KEPT = Steps(60, (8.0, 5.0, 3.0, 2.0), 0.02), 240, 6
+NEXT, NEXT_KEPT = Steps(200, (2.0, 1.0, 1.0, 1.0), 0.01), 2
+LAST = POLISH._replace(taus=(1.0, 1.0, 1.0))
 TRIAL_SAMPLES = 300
-"""For each step: samples per side, widths of the kernel in voxels, starts, and placements kept."""
+"""Steps of the search for a mirrored fit, with numbers of starts and of placements kept."""
 
 
 def mirror_gain(pair: Pair, found: Similarity, poor: bool) -> float:
@@ -32,27 +32,25 @@ def mirror_gain(pair: Pair, found: Similarity, poor: bool) -> float:
     `poor`, all orientations are searched, and scores are those after a trial deformation, if the
     parameters allow one.
     """
-    (best,) = pair.refine([Pose(found)], POLISH_SAMPLES, (), 0.01)
+    (best,) = pair.refine([Pose(found)], POLISH._replace(taus=()))
     if best.score > 1.0 - MIRRORED:
         return float("nan")
     mirrored = pair.mirrored()
-    tried = mirrored.refine(
-        _reflected(pair, best.similarity), REFLECTED_SAMPLES, REFLECTED_TAUS, 0.02
-    )
+    tried = mirrored.refine(_reflected(pair, best.similarity), REFLECTED)
     if not poor:
-        (other,) = mirrored.refine(_best(tried, 1), POLISH_SAMPLES, LAST_TAUS, 0.01)
+        (other,) = mirrored.refine(_best(tried, 1), LAST)
         return other.score - best.score
     kept = _best(tried, NEXT_KEPT)
     # Every second start is enough: several starts lead to a mirrored fit that is better.
     rotations = [s.rotation for s in distinct_starts()] + list(so3_starts(WIDE_STARTS)[::2])
     starts = mirrored.starts(rotations, pair.size_ratio)
-    kept += _best(mirrored.refine(starts, WIDE_SAMPLES, WIDE_TAUS, 0.02), WIDE_KEPT)
-    kept = _best(mirrored.refine(kept, NEXT_SAMPLES, NEXT_TAUS, 0.01), NEXT_KEPT)
+    kept += _best(mirrored.refine(starts, WIDE), WIDE_KEPT)
+    kept = _best(mirrored.refine(kept, NEXT), NEXT_KEPT)
     if pair.may_deform:
         there = try_out(mirrored.slat, pair.pixie, kept[0].similarity, TRIAL_SAMPLES)
         here = try_out(pair.slat, pair.pixie, best.similarity, TRIAL_SAMPLES)
         return there.whole - here.whole
-    (other,) = mirrored.refine(kept[:1], POLISH_SAMPLES, LAST_TAUS, 0.01)
+    (other,) = mirrored.refine(kept[:1], LAST)
     return other.score - best.score
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,13 +19,22 @@ from slatprep.geometry.frames import Array
 from slatprep.geometry.kernel import kernel
 from slatprep.parameters import AlignParameters
 
-COARSE_SAMPLES, POLISH_SAMPLES, FINE_SAMPLES = 100, 400, 2_000
-"""Samples per side for the starts, for the survivors, and for the last refinement."""
 
-COARSE_TAUS = (8.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0, 2.0)
-POLISH_TAUS = (2.0,) * 4 + (1.0,) * 4
-FINE_TAUS = (1.0,) * 10
-"""Width of the robust kernel at each step, in voxels."""
+class Steps(NamedTuple):
+    """How poses are refined: samples per side, and the robust kernel's width at each step.
+
+    Steps end once one moves the object's rim by less than the tolerance. Lengths are in voxels.
+    """
+
+    samples: int
+    taus: tuple[float, ...]
+    tolerance: float
+
+
+COARSE = Steps(100, (8.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0, 2.0), 0.02)
+POLISH = Steps(400, (2.0,) * 4 + (1.0,) * 4, 0.01)
+FINE = Steps(2_000, (1.0,) * 10, 0.002)
+"""Steps of the starts, of the survivors, and of the last refinement."""
 
 SURVIVORS, MOST_SURVIVORS = 4, 24
 """Smallest number, whatever they score, and largest number of placements that are polished."""
@@ -117,21 +127,13 @@ class Pair:
     def refine(
         self,
         poses: Sequence[Pose],
-        samples: int,
-        taus: Sequence[float],
-        tolerance: float,
+        steps: Steps,
         free_scale: bool | None = None,
         size_by_slat: bool = False,
     ) -> list[Pose]:
         """Refine each pose on an even subset of the samples; see `slatprep.align.solver.solve`."""
-        slat, pixie = self.subsets(samples)
-        low, high = self.parameters.scale_bounds
         refined = Poses.of([pose.similarity for pose in poses])
-        fits = solve(
-            slat.samples, pixie.samples, refined, np.array(taus, dtype=np.float64),
-            self.free_scale if free_scale is None else free_scale, size_by_slat,
-            (float(low), float(high)), tolerance,
-        )  # fmt: skip
+        fits = self.solve(refined, steps, free_scale, size_by_slat)
         return [
             Pose(similarity, 0.5 * (here + back), within, rmse, pose.bonus, pose.standing)
             for pose, similarity, (here, back, within, rmse) in zip(
@@ -139,12 +141,25 @@ class Pair:
             )
         ]
 
+    def solve(
+        self, poses: Poses, steps: Steps, free_scale: bool | None = None, size_by_slat: bool = False
+    ) -> Array:
+        """Refine poses in place, and return their fits (n, 4), as `solver.solve` does."""
+        slat, pixie = self.subsets(steps.samples)
+        low, high = self.parameters.scale_bounds
+        fits: Array = solve(
+            slat.samples, pixie.samples, poses, np.array(steps.taus, dtype=np.float64),
+            self.free_scale if free_scale is None else free_scale, size_by_slat,
+            (float(low), float(high)), steps.tolerance,
+        )  # fmt: skip
+        return fits
+
     def polish(self, poses: Sequence[Pose]) -> list[Pose]:
         """Refine the best distinct poses further and return them best first."""
         survivors = self.distinct(poses)
         likely = [p for p in survivors if p.score > survivors[0].score - 2 * TIE]
         survivors = survivors[: min(max(SURVIVORS, len(likely)), MOST_SURVIVORS)]
-        return self.distinct(self.refine(survivors, POLISH_SAMPLES, POLISH_TAUS, 0.01))
+        return self.distinct(self.refine(survivors, POLISH))
 
     def apart(self, poses: Sequence[Pose], other: Pose) -> Array:
         """Return the rms distance [voxel] of each pose from `other`, over the SLAT's surface.

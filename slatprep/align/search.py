@@ -12,14 +12,13 @@ import numpy as np
 
 from slatprep.align.deform import try_out
 from slatprep.align.pair import (
-    COARSE_SAMPLES,
-    COARSE_TAUS,
+    COARSE,
     DISTINCT,
-    POLISH_SAMPLES,
-    POLISH_TAUS,
+    POLISH,
     RANK_SAMPLES,
     RANK_STANDING,
     Pair,
+    Steps,
     far_apart,
     first_of_each,
     scale_penalty,
@@ -39,8 +38,8 @@ TURN, SLIDE, MOST_SLID, REACH = 12, 3.0, 20.0, 0.4
 """Steps of the moves of `repeated`, in degrees and voxels; the farthest slides, in voxels and as a
 share of the extent."""
 
-REPEATED_SAMPLES, REPEATED_KEPT = 40, 24
-"""Samples for the first steps of such poses, and the number of poses that are refined further."""
+REPEATED, REPEATED_KEPT = Steps(40, (3.0, 2.0), 0.02), 24
+"""First steps of such poses, and the number of poses that are refined further."""
 
 SAME_SIZE = 0.05
 """Largest difference of the size ratio from one without a second set of starts at scale one."""
@@ -82,15 +81,15 @@ def search_all(pair: Pair) -> tuple[list[Pose], list[Pose]]:
         # Floaters, ground and missing parts falsify sizes, and the likeliest scale is one.
         scales.append(1.0)
     sets: list[list[Pose]] = []
+    begin, end = COARSE.taus[:SO3_HALFWAY], COARSE.taus[SO3_HALFWAY:]
     for scale in scales:
         # The second set is half as dense, to save time.
         starts = pair.starts(so3_starts(SO3_STARTS)[:: 2 if sets else 1], scale)
-        taus = COARSE_TAUS[:SO3_HALFWAY]
         free = pair.free_scale and not sets
-        halfway = pair.refine(starts, COARSE_SAMPLES, taus, 0.02, free_scale=free)
+        halfway = pair.refine(starts, COARSE._replace(taus=begin), free_scale=free)
         sets.append(sorted(halfway, key=lambda pose: -pose.score))
     kept = [pose for some in sets for pose in some[: SO3_KEPT // len(sets)]]
-    refined = pair.refine(kept, COARSE_SAMPLES, COARSE_TAUS[SO3_HALFWAY:], 0.02)
+    refined = pair.refine(kept, COARSE._replace(taus=end))
     return refined, sets[0]
 
 
@@ -116,13 +115,12 @@ def repeated(pair: Pair, best: Pose) -> list[Pose]:
     moved = np.concatenate([np.zeros((len(turns), 3)), *[slides] * 4])
     own = best.similarity
     shifts = turned @ (own.shift - centre) + centre + moved
-    starts = [
-        Pose(own._replace(rotation=rotation, shift=shift))
-        for rotation, shift in zip(turned @ own.rotation, shifts, strict=True)
-    ]
-    halfway = pair.refine(starts, REPEATED_SAMPLES, (3.0, 2.0), 0.02)
-    kept = sorted(halfway, key=lambda pose: -pose.score)[:REPEATED_KEPT]
-    return pair.polish(pair.refine(kept, COARSE_SAMPLES, (2.0, 1.0), 0.02))
+    scales, offsets = (np.full(len(turned), each) for each in (own.scale, own.offset))
+    starts = Poses(turned @ own.rotation, shifts, scales, offsets)
+    fits = pair.solve(starts, REPEATED)
+    order = np.argsort(-fits[:, :2].sum(axis=1), kind="stable")[:REPEATED_KEPT]
+    kept = Poses(*(each[order] for each in starts)).similarities()
+    return pair.polish(pair.refine([*map(Pose, kept)], COARSE._replace(taus=(2.0, 1.0))))
 
 
 def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:
@@ -159,7 +157,7 @@ def stretched(pair: Pair, near: Sequence[Pose], halfway: Sequence[Pose]) -> list
     first = _stretch(pair, _unstretched(halfway), *STRETCH_MANY)
     found = _stretch(pair, [*_unstretched(near), *first], *STRETCH_FEW)
     likely = [s for s in found if s.score > found[0].score - RANK_WITHIN]
-    points = pair.subsets(POLISH_SAMPLES)[0].points
+    points = pair.subsets(POLISH.samples)[0].points
     bounds = pair.parameters.scale_bounds
     similar = [
         Pose(from_nearest(s.pose.similarity, s.warp, points, bounds)[0])
@@ -167,7 +165,7 @@ def stretched(pair: Pair, near: Sequence[Pose], halfway: Sequence[Pose]) -> list
         if s.pose not in near
     ]
     if similar:
-        similar = pair.refine(similar, POLISH_SAMPLES, POLISH_TAUS, 0.01)
+        similar = pair.refine(similar, POLISH)
     return pair.distinct([*(s.pose for s in likely if s.pose in near), *similar])
 
 

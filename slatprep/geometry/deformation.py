@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -206,14 +207,24 @@ def is_proper(deformation: Deformation) -> bool:
 
 def _least_stretch(deformation: Deformation, steps: int) -> float:
     """Return the minimum of 2 det / |J|^2 over a grid of `steps` points per span."""
-    # Points are in units of spans, so that rounding moves none of them out of the domain.
-    spans = replace(deformation, affine=np.zeros((3, 4)), origin=np.zeros(3), spacing=1.0)
-    at = [np.arange(steps * (n - 3) + 1) / steps for n in deformation.coefficients.shape[:3]]
-    points = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1).reshape(-1, 3)
-    slopes = deformation.affine[:, :3] + jacobian(spans, points) / deformation.spacing
-    a, b, c = np.moveaxis(slopes, 1, 0)
-    determinant = (a * np.cross(b, c)).sum(axis=1)
-    return float((2.0 * determinant / (slopes**2).sum(axis=(1, 2))).min())
+    control = deformation.coefficients / deformation.spacing
+    axes = [_splines(count, steps) for count in control.shape[:3]]
+    splines = ([both[axis == along] for axis, both in enumerate(axes)] for along in range(3))
+    slopes = [np.einsum("ijkx,ia,jb,kc->xabc", control, *s, optimize=True) for s in splines]
+    matrix = deformation.affine[:, :3].T[..., None, None, None]
+    a, b, c = np.stack(slopes) + matrix  # rows: the derivatives along each axis
+    determinant = (a * np.cross(b, c, axis=0)).sum(axis=0)
+    return float((2.0 * determinant / (a**2 + b**2 + c**2).sum(axis=0)).min())
+
+
+@lru_cache(maxsize=256)
+def _splines(count: int, steps: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return values and derivatives (count, points) of an axis's splines, per span."""
+    from scipy.interpolate import BSpline
+
+    at = np.arange(steps * (count - 3) + 1) / steps
+    spline = BSpline(np.arange(-3.0, count + 1.0), np.eye(count), 3)
+    return spline(at).T, spline.derivative()(at).T
 
 
 def bending_of(deformation: Deformation) -> float:

@@ -18,7 +18,7 @@ from support.shapes import GRID, chair, field_of, judged, latents_of, surface_la
 from slatprep.align import align, engine_versions, solver
 from slatprep.align.field import BEATEN, fitted_near
 from slatprep.align.ground import RAISED
-from slatprep.align.pair import FINE_SAMPLES, TIE
+from slatprep.align.pair import FINE, TIE
 from slatprep.align.starts import distinct_starts
 from slatprep.api import align_voxels
 from slatprep.errors import SlatprepError
@@ -143,7 +143,7 @@ def test_the_search_looks_at_no_more_of_a_grid_full_of_voxels(monkeypatch):
 
     def counted(*given: Any) -> Any:
         slat, pixie, poses, taus = given[:4]
-        assert max(len(slat.values), len(pixie.values)) <= FINE_SAMPLES
+        assert max(len(slat.values), len(pixie.values)) <= FINE.samples
         work[-1] += (len(slat.values) + len(pixie.values)) * len(poses.scales) * len(taus)
         return solve(*given)
 

@@ -17,13 +17,13 @@ from slatprep.align.consensus import degrees_between
 from slatprep.align.finish import MOST_CONTESTED, finish
 from slatprep.align.pair import (
     DISTINCT,
-    FINE_SAMPLES,
-    FINE_TAUS,
+    FINE,
     MOST_SURVIVORS,
     RANK_STANDING,
     SURVIVORS,
     TIE,
     Pair,
+    Steps,
     far_apart,
 )
 from slatprep.align.pose import Pose, Similarity
@@ -161,7 +161,7 @@ def test_scale_is_refined_only_where_it_is_free():
     for model, free, held in (("auto", None, False), ("auto", False, True),
                               ("rigid", None, True), ("rigid", True, False)):  # fmt: skip
         pair = pair_of(parameters=AlignParameters(model=model))
-        (found,) = pair.refine([start], 400, (4.0,) * 8, 1e-4, free_scale=free)
+        (found,) = pair.refine([start], Steps(400, (4.0,) * 8, 1e-4), free_scale=free)
         if held:
             assert found.similarity.scale == 1.06
             continue
@@ -174,7 +174,7 @@ def test_scale_is_refined_only_where_it_is_free():
 def test_the_score_is_the_mean_kernel_of_both_sides():
     pair = pair_of(placed(0.8), placed(0.7))
     poses = [Pose(p.similarity._replace(offset=0.2)) for p in any_poses(5, 4)]
-    for pose, scored in zip(poses, pair.refine(poses, 10**6, (), 0.01), strict=True):
+    for pose, scored in zip(poses, pair.refine(poses, Steps(10**6, (), 0.01)), strict=True):
         forward, backward = residuals(pair.slat, pair.pixie, pose.similarity, np.eye(3, 4))
         expected = 0.5 * (mean_kernel(forward) + mean_kernel(backward))
         assert scored.score == pytest.approx(expected, rel=1e-5)
@@ -184,7 +184,7 @@ def test_the_score_is_the_mean_kernel_of_both_sides():
 
 def test_marks_of_a_pose_outlive_its_refinement():
     start = replace(moved_by(0.5, 0.0, 0.0), bonus=0.1, standing=0.01)
-    (found,) = pair_of().refine([start], 100, (2.0,), 0.01)
+    (found,) = pair_of().refine([start], Steps(100, (2.0,), 0.01))
     assert (found.bonus, found.standing) == (0.1, 0.01)
 
 
@@ -306,7 +306,7 @@ def squashed() -> tuple[Pair, list[Pose]]:
     centres = GRID.reshape(-1, 3) - 31.5
     pair = pair_of(crate(centres / [1.1, 1.1, 0.7]), crate(centres))
     starts = pair.starts([start.rotation for start in distinct_starts()], 1.0)
-    return pair, pair.distinct(pair.refine(starts, 400, (8.0, 4.0, 2.0, 2.0, 2.0), 0.02))
+    return pair, pair.distinct(pair.refine(starts, Steps(400, (8.0, 4.0, 2.0, 2.0, 2.0), 0.02)))
 
 
 def test_where_shapes_differ_the_order_is_by_what_a_trial_deformation_leaves(squashed):
@@ -359,7 +359,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squ
     (best, *others), deformed = finish(pair, chosen, rough=True)
     assert deformed.deformation is not None
     assert upright(best) < 10.0
-    fine = pair.refine(chosen, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=True)
+    fine = pair.refine(chosen, FINE, size_by_slat=True)
     # It takes over the score that the best one had, and the others have less.
     assert best.merit == pytest.approx(max(pose.score for pose in fine), abs=0.02)
     assert others
@@ -369,7 +369,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squ
 
 def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(squashed):
     pair, poses = squashed
-    fine = pair.refine(poses, FINE_SAMPLES, FINE_TAUS, 0.002, size_by_slat=True)
+    fine = pair.refine(poses, FINE, size_by_slat=True)
     many = pair.distinct(fine)
     assert len(many) > MOST_CONTESTED + 2
     found, _ = finish(pair, poses, rough=True)
