@@ -35,8 +35,10 @@ from slatprep.workers.local import Jobs, run_unordered
 DECOYS = 200
 """Number of decoys of a dataset, which has at most one for each asset."""
 
-EVERY = 20
-"""Number of assets that a build aligns for each decoy that it aligns: 5 % more work."""
+EVERY, SPARSELY = 20, 60
+"""Number of assets that a build aligns for each decoy that it aligns, up to `LEAST_DECOYS` decoys,
+and for each one more. A decoy takes three times as long as an asset, so a large build takes 5 %
+longer."""
 
 ALIKE = 0.2
 """Least share of decoys called good at which objects are too much alike for decoys to tell."""
@@ -269,23 +271,28 @@ def measure_errors(
 def measure_build(
     store: Store, aligned: int, most: int, crew: Crew, before: SourceStore | None
 ) -> None:
-    """Measure the errors of a store that a build has just written, within the limit of `EVERY`.
+    """Measure the errors of a store that a build has just written, on as many decoys as allowed.
 
     `aligned` is the number of assets that the build aligned, `most` the largest number of decoys,
     and `before` the store that was replaced. If no decoy is allowed, the earlier measurement stays,
     and `told_of` says that it is an earlier one.
     """
     measured = measured_errors(store.path) or (measured_errors(before.path) if before else None)
-    new = min(aligned // EVERY, most)
+    new = min(allowed_decoys(aligned), most)
     if new == 0 or len(store) < LEAST_TARGETS or _no_decoys(store):
         if measured:
             _write(store, measured)
         return
     crew.tell(f"measuring errors on at most {new:,} new decoys")
     # A person may have asked for more decoys before; their number is kept.
-    count = max(min(len(store) // EVERY, most), len(measured.decoys) if measured else 0)
-    seed, jobs = measured.seed if measured else 0, crew.of(aligned // EVERY)
+    count = max(min(allowed_decoys(len(store)), most), len(measured.decoys) if measured else 0)
+    seed, jobs = measured.seed if measured else 0, crew.of(new)
     measure_errors(store, count, seed, jobs, most_new=new, before=measured)
+
+
+def allowed_decoys(assets: int) -> int:
+    """Return how many decoys a build of so many assets may align; see `EVERY`."""
+    return max(min(assets // EVERY, LEAST_DECOYS), assets // SPARSELY)
 
 
 def _no_decoys(store: Store) -> str:

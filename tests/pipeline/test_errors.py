@@ -13,7 +13,13 @@ from support.trees import copied, tree
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
-from slatprep.pipeline.decoys import draw_decoys, measure_errors, measured_errors, told_of
+from slatprep.pipeline.decoys import (
+    allowed_decoys,
+    draw_decoys,
+    measure_errors,
+    measured_errors,
+    told_of,
+)
 from slatprep.store import Store, open_store
 from slatprep.store.records import ERRORS, manifests_of
 
@@ -140,6 +146,13 @@ def few_suffice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let six assets be enough, and every second one have a decoy."""
     monkeypatch.setattr(decoys, "LEAST_TARGETS", 4)
     monkeypatch.setattr(decoys, "EVERY", 2)
+
+
+@pytest.mark.parametrize(("assets", "decoys"), [
+    (19, 0), (20, 1), (799, 39), (800, 40), (2_459, 40), (2_460, 41), (12_000, 200),
+])  # fmt: skip
+def test_how_many_decoys_a_build_may_align(assets, decoys):
+    assert allowed_decoys(assets) == decoys
 
 
 @pytest.mark.usefixtures("few_suffice")
