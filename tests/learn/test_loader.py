@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -263,6 +264,23 @@ def test_parameters_are_as_many_as_the_paper_says(size, millions):
     parameters = sum(p.numel() for p in decoder.make_decoder(size).parameters())
     assert parameters / 1e6 == pytest.approx(millions, abs=0.0051)
     assert set(decoder.SIZES) >= {"small", "medium", "large"}
+
+
+def test_no_attention_compiles_a_plan_for_each_shape(monkeypatch):
+    # As cuDNN's does: windows have hundreds of shapes, and each plan takes 0.02 s.
+    usual, compiles = decoder.functional.scaled_dot_product_attention, []
+
+    def watched(*args: Any, **kwargs: Any) -> Tensor:
+        compiles.append(torch.backends.cuda.cudnn_sdp_enabled())
+        return usual(*args, **kwargs)
+
+    monkeypatch.setattr(decoder.functional, "scaled_dot_product_attention", watched)
+    attention = decoder.WindowAttention(24, 2).to("meta")  # A device that is no CPU.
+    mask = torch.ones(3, 5, dtype=torch.bool, device="meta")
+    places = torch.arange(15, device="meta")
+    windows = decoder.Windows(places, [mask], places)
+    assert attention(torch.zeros(15, 24, device="meta"), windows).shape == (15, 24)
+    assert compiles == [False]
 
 
 @pytest.mark.parametrize("shift", [0, 4])
