@@ -1,10 +1,9 @@
 """Robust Gauss-Newton for similarities between two distance fields; compiled.
 
-Unknowns are a twist of the PixieVerse side in the SLAT frame (rotation w, shift
-v), the logarithm of its scale, and an offset o between the two distances. The
-centre of rotation and scale is the centre c of the SLAT samples. With F = s f_P(T^-1 x) the
-PixieVerse
-distance carried to the SLAT frame, the residuals are
+Unknowns are a twist of the PixieVerse side in the SLAT frame (rotation w, shift v), the logarithm
+of its scale, and an offset o between the two distances. The centre of rotation and scale is the
+centre c of the SLAT samples. With F = s f_P(T^-1 x) the PixieVerse distance carried to the SLAT
+frame, the residuals are
 
     r = F(x) - f_S(x) - o            at SLAT samples x,
     r = f_S(T y) - s f_P(y) + o      at PixieVerse samples y,
