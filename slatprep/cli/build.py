@@ -166,7 +166,7 @@ def build_store(
         assets again does not read their sources.
     decoys : N
         Measure errors on at most N decoys: grids aligned with SLATs of other objects, one for every
-        20 assets that are aligned. 0: none.
+        20 assets that are aligned, up to 40 decoys, or one for every 60 if that is more. 0: none.
     dry_run
         Print what would be done with each asset, and why; write nothing.
 

@@ -7,17 +7,18 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, InputError, amount
+from slatprep.errors import ConfigError, InputError, amount, require_one_of
 from slatprep.geometry.voxels import voxels_of
 from slatprep.learn.metrics import (
     COLUMNS,
     METRICS,
     OURS,
+    SPREADS,
     Measures,
     Spread,
     average_methods,
@@ -125,11 +126,13 @@ def evaluate_store(
     id>/sample_<k>/material_grid.npy`` or ``<object id>.npy``. Split and filters are those of
     `slatprep.learn.splits.select_assets`. An asset without a usable prediction of every method is
     left out of all and named. InputError if none is left; ConfigError if grids are given and the
-    store holds other properties or classes.
+    store holds other properties or classes, or there is no such spread.
     """
+    require_one_of("spread", spread, tuple(SPREADS))
     store, grids = open_store(store_path), grids or {}
     if grids:
         _require_pixieverse(store)
+    object_ids = store.column("object_id")
     found = {name: find_grids(PixieverseSource(root, _GRIDS)) for name, root in grids.items()}
     trained = select_assets(store, "train", **filters).tolist()
     baselines = fit_baselines(store, trained) if trained else ()
@@ -141,16 +144,17 @@ def evaluate_store(
     converted = 0
     with open_predictions(predictions) if predictions else nullcontext() as read:
         for index in select_assets(store, split, **filters).tolist():
-            truth = _Truth(store, index, bool(grids))
+            asset_id, object_id = store.ids[index], str(object_ids[index])
             try:
-                arrays = read(truth.asset_id) if read else {}
+                arrays = read(asset_id) if read else {}
                 if arrays is None:
-                    missing.append(truth.asset_id)
+                    missing.append(asset_id)
                     continue
+                truth = _Truth(store, index, bool(grids))
                 ours = truth.checked(predictions, arrays) if predictions else None
                 rows = [truth.score(ours)] if ours else []
                 for name, root in grids.items():
-                    rows += truth.score_grid(root, found[name].get(truth.object_id, []))
+                    rows += truth.score_grid(root, found[name].get(object_id, []), object_id)
             except InputError as error:
                 bad.append(str(error))
                 continue
@@ -158,17 +162,19 @@ def evaluate_store(
             if ours:
                 converted += ours.converted
                 if ours.material is None and store.contents.classes:
-                    classless.append(truth.asset_id)
+                    classless.append(asset_id)
             if grids and (truth.grid == UNANNOTATED).any():
-                partly.add(truth.object_id)
+                partly.add(object_id)
+    problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
     if not scored:
-        _fail(predictions, grids, split, missing, bad)
+        places = [*filter(None, [predictions, *grids.values()]), store.path]
+        alone = predictions is not None and not grids
+        raise _nothing_scored(places[0], alone, f"split {split or 'all'}", problems, missing)
     names = [OURS] if predictions else []
     names += [f"{name}, {where}" for name in grids for where in ("SLAT voxels", "own grid")]
     names += [one.name for one in baselines]
     methods, groups = average_methods(store, scored, names, spread)
     beside = {one.name: methods.pop(one.name) for one in baselines}
-    problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
     return Evaluation(
         spread, methods, beside, groups, missing, problems, classless, converted, len(partly)
     )
@@ -188,7 +194,6 @@ class _Truth:
 
     def __init__(self, store: Store, index: int, with_grid: bool) -> None:
         self.store, self.index, self.asset_id = store, index, store.ids[index]
-        self.object_id = str(store.column("object_id")[index])
         self.voxels = store.read(index, (*COLUMNS, "place") if with_grid else COLUMNS)
         if with_grid:
             self.grid = np.asarray(store.read_rows("grid/material", index, index + 1)[0])
@@ -206,9 +211,11 @@ class _Truth:
             prediction = replace(prediction, material=None)
         return score_asset(prediction, self.voxels)
 
-    def score_grid(self, root: Path, found: Sequence[FoundField]) -> Iterator[NDArray[np.float64]]:
+    def score_grid(
+        self, root: Path, found: Sequence[FoundField], object_id: str
+    ) -> Iterator[NDArray[np.float64]]:
         """Yield the metrics of a predicted grid at the SLAT's voxels, and on the grid itself."""
-        path = one_grid(root, found, self.object_id, _GRIDS)
+        path = one_grid(root, found, object_id, _GRIDS)
         annotated = self.grid < BACKGROUND
         ranges = self.store.normalization
         properties, material = read_prediction(path, root, annotated, ranges)
@@ -230,23 +237,25 @@ class _Truth:
         yield score_asset(VoxelPrediction(properties, material.astype(np.int64)), own)
 
 
-def _fail(
-    predictions: Path | None,
-    grids: Mapping[str, Path],
-    split: Split | None,
-    missing: Sequence[str],
-    bad: Sequence[str],
-) -> NoReturn:
-    """Raise InputError, as no asset can be scored."""
-    where = f"of an asset of split {split or 'all'}"
-    place = predictions or next(iter(grids.values()))
-    if bad:
-        raise InputError(
+def _nothing_scored(
+    place: Place, alone: bool, split: str, problems: Sequence[str], missing: Sequence[str]
+) -> InputError:
+    """Return the error that no asset of a split can be scored; `alone` if there are no grids."""
+    where = f"of an asset of {split}"
+    if not alone:
+        first = problems[0] if problems else "the split is empty"
+        return InputError(
+            place,
+            f"no asset of {split} has a prediction of every method ({first})",
+            "predictions of the same objects",
+        )
+    if bad := problems[len(missing) :]:
+        return InputError(
             place,
             f"has {amount(len(bad), 'prediction')} {where}, and none can be used ({bad[0]})",
             "normalised properties of every voxel",
         )
-    raise InputError(
+    return InputError(
         place,
         f"has no prediction {where}",
         f"ids of that split, such as {', '.join(missing[:3]) or 'none: the split is empty'}",

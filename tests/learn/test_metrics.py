@@ -21,7 +21,7 @@ from support.made_store import edit_attributes
 from support.predictions import right, write_one, write_predictions, zeros
 from support.synthetic import Dataset
 
-from slatprep import InputError, open_store
+from slatprep import ConfigError, InputError, open_store
 from slatprep.learn.evaluate import Evaluation, evaluate_store
 from slatprep.learn.metrics import METRICS, OURS, average_methods
 from slatprep.learn.published import PIXIE_TABLE, SLAT_PHYS_TABLE, read_scores
@@ -477,6 +477,29 @@ def test_nothing_in_common_is_an_error(case, tmp_path):
     written(tmp_path / "other.npy", np.zeros((4, 64, 64, 64), np.float32))
     with pytest.raises(InputError, match="no grid for id 'a'"):
         compared(case, tmp_path)
+    ours = write_predictions(tmp_path / "ours", case.store, right)
+    grids = {"m": tmp_path}
+    with pytest.raises(InputError, match=r"every method .*no grid for id 'a'"):
+        evaluate_store(ours, case.store, None, grids=grids, splits={})
+    with pytest.raises(ConfigError, match="spread is 'sdev'"):
+        evaluate_store(ours, case.store, None, "sdev")  # type: ignore[arg-type]
+
+
+def test_with_grids_the_same_reference_models_stand_beside(case, tmp_path):
+    folder = write_predictions(tmp_path / "ours", case.store, right)
+    for name in NAMES:
+        with np.load(folder / f"{name}.npz") as held:
+            arrays = dict(held)
+        arrays["ranges"] = open_store(case.store).normalization.spans
+        np.savez(folder / f"{name}.npz", **arrays)
+    splits = dict.fromkeys(NAMES, "train")
+    alone, beside = (
+        evaluate_store(folder, case.store, "train", grids=grids, splits=splits)
+        for grids in ({}, {"m": case.results})
+    )
+    assert alone.baselines == beside.baselines and len(alone.baselines) == 2
+    assert alone.methods[OURS] == beside.methods[OURS]
+    assert alone.partly_annotated == 0
 
 
 def test_occupied_voxels_without_a_class_are_counted(make_dataset, tmp_path):
