@@ -165,8 +165,9 @@ def build_store(
         Keep all assets' arrays beside the store, about 1 MB each, so that an update that packs all
         assets again does not read their sources.
     decoys : N
-        Measure errors on at most N decoys: grids aligned with SLATs of other objects, one for every
-        20 assets that are aligned, up to 40 decoys, or one for every 60 if that is more. 0: none.
+        Measure errors on at most N decoys: grids aligned with SLATs of other objects. Up to 40,
+        there is one for every 20 assets that are aligned; from 2,400 assets on, for every 60.
+        0: none.
     dry_run
         Print what would be done with each asset, and why; write nothing.
 
