@@ -18,7 +18,7 @@ from slatprep.errors import apart_from
 if TYPE_CHECKING:
     from slatprep.learn.metrics import Measure
     from slatprep.learn.published import PublishedScore
-    from slatprep.records import Place
+    from slatprep.store import Store
 
 
 @command()
@@ -59,7 +59,7 @@ def evaluate(
     spread
         Standard error or standard deviation over objects, or the spread that Pixie prints.
     csv_file
-        Also write the table to this file.
+        Also write the table to this file, without the reference models.
     picture
         With --grids, also draw the table.
     beside : pixie|slat-phys|FILE.csv
@@ -75,8 +75,8 @@ def evaluate(
     slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
     """
     from slatprep.inspect.overview import UNKNOWN
-    from slatprep.learn.evaluate import draw_comparison, evaluate_store
-    from slatprep.learn.metrics import OURS, SPREADS
+    from slatprep.learn.evaluate import draw_comparison, evaluate_store, require_pixieverse
+    from slatprep.learn.metrics import OURS, SPREADS, metrics_of
     from slatprep.learn.predictions import predictions_of
     from slatprep.learn.published import TABLES, read_scores
 
@@ -86,16 +86,26 @@ def evaluate(
         raise click.UsageError("--picture draws methods side by side; give --grids as well")
     predictions = predictions and predictions_of(predictions)
     folders = _folders_of_grids(grids)
+    opened = options.opened(store)
+    metrics = metrics_of(opened.normalization)
     published = {
-        name: TABLES[name][1] if name in TABLES else read_scores(Path(name)) for name in beside
+        name: TABLES[name][1] if name in TABLES else read_scores(Path(name), metrics)
+        for name in beside
     }
-    filters, left_out = _selected(output, predictions, store, split, splits)
+    for name in TABLES.keys() & published:
+        require_pixieverse(opened, f"the scores of --beside {name}")
+    filters, left_out = _selected(output, predictions, opened, split, splits)
     result = evaluate_store(predictions, store, spread=spread, grids=folders, **filters)
     measures, what = result.methods, "method"
     if not grids:
         groups, others = result.categories.items(), {UNKNOWN, "all", *result.baselines}
         measures = {apart_from(name, others) or UNKNOWN: own[OURS] for name, own in groups}
         measures["all"], what = result.methods[OURS], "category"
+    if grids and opened.merges:
+        output.note(
+            "note:    labels are merged from several annotations, and own grids are measured on "
+            "the first of them"
+        )
     if result.partly_annotated:
         output.note(
             "note:    objects with occupied voxels that have no annotation and are not scored: "
@@ -120,11 +130,10 @@ def evaluate(
         document["beside"] = [score for scores in published.values() for score in scores]
 
     def show() -> None:
-        names = tuple(next(iter(measures.values())).means)
         output.table(
             "Mean squared error in normalised space, class accuracy "
             f"(± {SPREADS[spread]} over n objects)",
-            (what, "n", *names),
+            (what, "n", *metrics),
             [_row_of_scores(name, one) for name, one in (measures | result.baselines).items()],
         )
         if TABLES.keys() & published:
@@ -142,7 +151,11 @@ def evaluate(
 
 
 def _selected(
-    output: Output, predictions: Path | None, store: Place, split: Any, splits: options.SplitOptions
+    output: Output,
+    predictions: Path | None,
+    store: Store,
+    split: Any,
+    splits: options.SplitOptions,
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the selection of assets, by the options or by a run, and lines on omitted assets."""
     from slatprep.learn.predictions import selection_of_run
@@ -157,16 +170,15 @@ def _selected(
         how = f"as {file} says"
     elif not splits.given:
         how += ", as no run lies beside the predictions (others: --split-by, --split all)"
-    opened = options.opened(store)
-    of_object = options.split_of_objects(output, opened, rule, f"{split}, {how}")
+    of_object = options.split_of_objects(output, store, rule, f"{split}, {how}")
     part = None if split == "all" else split
     without = set[int]()
     if filters:
-        rows, kept = (select_assets(opened, part, splits=of_object, **own) for own in ({}, filters))
+        rows, kept = (select_assets(store, part, splits=of_object, **own) for own in ({}, filters))
         without = {*rows.tolist()} - {*kept.tolist()}
     verdicts = filters.get("verdicts") or tuple(Verdict)
     others = f"above the ambiguity {filters.get('max_ambiguity')}"
-    left_out = options.note_left_out(output, opened, without, verdicts, how, others)
+    left_out = options.note_left_out(output, store, without, verdicts, how, others)
     return {"split": part, "splits": of_object, **filters}, left_out
 
 
@@ -220,4 +232,4 @@ def _row_of_scores(name: str, scores: Measure) -> tuple[str | int, ...]:
     """Return a row of the printed table: each mean with its spread, if there is one."""
     cells = zip(scores.means.values(), scores.spreads.values(), strict=True)
     texts = (f"{mean:.3f}" + ("" if math.isnan(s) else f"±{s:.3f}") for mean, s in cells)
-    return name, scores.objects, *texts
+    return name, scores.objects, *("-" if text == "nan" else text for text in texts)

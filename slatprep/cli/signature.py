@@ -226,10 +226,11 @@ def _inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
     for name, value in given.items():
         for one in value if isinstance(value, tuple) else (value,):
             if isinstance(one, str):
-                # The value may be a word, or a file of ranges or ids. Folders of grids,
-                # [NAME=]DIR, are ignored, because a word like "train" may also name a folder.
+                # The value may be a word, a file of ranges or ids, or [NAME=]DIR. Elsewhere than
+                # in --grids a word like "train" may also name a folder.
                 path = one.rpartition("=")[2]
-                if os.path.isfile(path):  # noqa: PTH113 - a word too long for a name is no error
+                exists = os.path.exists if name == "grids" else os.path.isfile
+                if exists(path):  # A word too long for a name is no error.
                     yield name, Path(path)
             elif is_place(one) and (local := storage_of(one).local) is not None:
                 yield name, local

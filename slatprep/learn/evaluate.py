@@ -131,7 +131,7 @@ def evaluate_store(
     require_one_of("spread", spread, tuple(SPREADS))
     store, grids = open_store(store_path), grids or {}
     if grids:
-        _require_pixieverse(store)
+        require_pixieverse(store, "grids of Pixie's form")
     object_ids = store.column("object_id")
     found = {name: find_grids(PixieverseSource(root, _GRIDS)) for name, root in grids.items()}
     trained = select_assets(store, "train", **filters).tolist()
@@ -180,12 +180,13 @@ def evaluate_store(
     )
 
 
-def _require_pixieverse(store: Store) -> None:
+def require_pixieverse(store: Store, others: str) -> None:
+    """Raise ConfigError if a store holds other properties or classes than PixieVerse's."""
     held = tuple(one.name for one in store.contents.properties), store.contents.classes
     if held != (PROPERTY_COLUMNS, MATERIAL_CLASSES):
         raise ConfigError(
-            f"{store.path} holds {', '.join(held[0])} and {len(held[1])} classes, which grids of "
-            "Pixie's form do not; expected a store of PixieVerse's properties and classes"
+            f"{store.path} holds {', '.join(held[0])} and {len(held[1])} classes, which {others} "
+            "do not; expected a store of PixieVerse's properties and classes"
         )
 
 

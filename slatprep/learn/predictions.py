@@ -112,9 +112,15 @@ class _Selection:
 
 
 def predictions_of(path: Path) -> Path:
-    """Return the predictions in the folder of a training run; any other path as it is."""
-    inside = path / PREDICTIONS
-    return inside if (path / RUN_FILE).exists() and inside.is_dir() else path
+    """Return the predictions in the folder of a training run; any other path as it is.
+
+    InputError if the run has none yet.
+    """
+    if not (path / RUN_FILE).exists():
+        return path
+    if not (path / PREDICTIONS).is_dir():
+        raise InputError(path, "is a training without predictions", "one that has ended")
+    return path / PREDICTIONS
 
 
 def selection_of_run(predictions: Path) -> tuple[Path, dict[str, Any], dict[str, Any]] | None:
@@ -125,6 +131,8 @@ def selection_of_run(predictions: Path) -> tuple[Path, dict[str, Any], dict[str,
     InputError if the file lacks one of them.
     """
     file = predictions.absolute().parent / RUN_FILE
+    if predictions.is_symlink() and not file.exists():
+        file = predictions.resolve().parent / RUN_FILE
     if not file.exists():
         return None
     try:

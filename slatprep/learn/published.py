@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +20,7 @@ class PublishedScore:
     method : str
         Name of the method.
     means : dict of str to float
-        Mean by metric, for some of `slatprep.learn.metrics.METRICS`.
+        Mean by metric, for some of `slatprep.learn.metrics.metrics_of`.
     spreads : dict of str to float
         The number after ± of each metric, if published.
     spread : str
@@ -86,14 +87,13 @@ SECONDS_OF_OTHERS = {"NeRF2Physics": 1196.0, "Pixie": 1261.0}
 """Seconds an object of other methods, as SLAT-Phys prints them: 121 and 128 times its own."""
 
 
-def read_scores(path: Path) -> tuple[PublishedScore, ...]:
+def read_scores(path: Path, metrics: Sequence[str] = METRICS) -> tuple[PublishedScore, ...]:
     """Read a table of scores without spreads, such as from ``slatprep evaluate --csv``.
 
-    The CSV has the methods' names in the first column and some of the columns "log10 E", "log10
-    density", "nu", "mean" and "accuracy". InputError if it has none of them, or an entry is no
-    number.
+    The CSV has the methods' names in the first column, and some of the `metrics` as columns.
+    InputError if it has none of them, or an entry is no number.
     """
-    expected = f"a CSV with a name in the first column and some of {', '.join(METRICS)}"
+    expected = f"a CSV with a name in the first column and some of {', '.join(metrics)}"
     try:
         with path.open(encoding="utf-8", newline="") as file:
             lines = [row for row in csv.reader(file) if row]
@@ -102,7 +102,7 @@ def read_scores(path: Path) -> tuple[PublishedScore, ...]:
     except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
         raise InputError(path, f"cannot be read ({error})", expected) from error
     header, *rows = lines
-    places = {name: header.index(name) for name in METRICS if name in header[1:]}
+    places = {name: header.index(name) for name in metrics if name in header[1:]}
     if not places:
         raise InputError(path, f"has the columns {', '.join(header)}", expected)
     twice = [name for name in places if header.count(name) > 1]

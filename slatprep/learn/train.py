@@ -107,6 +107,9 @@ class TrainParameters:
     def __post_init__(self) -> None:
         for name, allowed in (("size", tuple(SIZES)), ("precision", PRECISIONS), ("keep", KEEPS)):
             require_one_of(name, getattr(self, name), allowed)
+        for name in ("epochs", "steps", "batch_size", "accumulate"):
+            if (count := getattr(self, name)) is not None and count < 1:
+                raise ConfigError(f"{name} is {count}; expected at least 1")
         words = words_of(self.verdicts)
         object.__setattr__(self, "verdicts", tuple(Verdict if "all" in words else words))
 

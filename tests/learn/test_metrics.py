@@ -467,10 +467,13 @@ def test_side_by_side_on_the_same_objects(case, tmp_path):
     (("{results}", "--picture", "x.png"), "--picture draws methods"),
     (("--grids", "={results}"), "has no name before ="),
     (("--grids", "{results}", "--picture", "x.gif"), "x.gif ends in none of .png, .svg, .pdf"),
+    (("--grids", "M={results}", "--csv", "{results}/a/sample_0_pred.npy"),
+     "sample_0_pred.npy lies in {results}, what the command reads"),
 ])  # fmt: skip
 def test_what_cannot_be_compared_is_said(case, arguments, message):
     filled = (argument.format(results=case.results) for argument in arguments)
-    assert message in refused("evaluate", *filled, "--store", case.store)
+    told = refused("evaluate", *filled, "--store", case.store)
+    assert message.format(results=case.results) in told
 
 
 def test_nothing_in_common_is_an_error(case, tmp_path):

@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -386,9 +387,21 @@ def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, tmp_path):
     assert f"as {out / 'run.json'} says: 3 train, 1 val, 2 test" in measured.stderr
     assert run(*words, "--split-by", out / "splits.json").stdout == measured.stdout
 
+    # A link to the predictions is of the same run, and a run without any has not ended.
+    (tmp_path / "link").symlink_to(out / "predictions")
+    assert run("evaluate", tmp_path / "link", *words[2:]).stdout == measured.stdout
+    shutil.rmtree(out / "predictions")
+    assert "is a training without predictions" in refused("evaluate", out, *words[2:], code=1)
+
     # A file that says something else by the time that the run goes on is another run.
     lists.write_text(json.dumps(BY_FILE | {"val": ["d", "g"]}))
     assert "splits" in refused(*command)
+
+
+@pytest.mark.parametrize("name", ["epochs", "steps", "batch_size", "accumulate"])
+def test_a_training_takes_at_least_one_of_each(name):
+    with pytest.raises(ConfigError, match=f"{name} is 0; expected at least 1"):
+        TrainParameters(**{name: 0})
 
 
 def test_evaluate_outside_a_run_says_which_split_it_takes(learn_store, tmp_path):

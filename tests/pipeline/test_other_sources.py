@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 from scipy.spatial import cKDTree
-from support.commands import run
+from support.commands import document, refused, run
+from support.predictions import write_predictions
 from support.synthetic import QUARTER_TURN, SMALL_SHARDS, make_asset
 
 from slatprep import build_store, compare_stores, export_store, open_store, store_statistics
@@ -298,6 +299,15 @@ def test_pixie_s_grids_are_not_measured_against_other_properties(tmp_path):
     build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
     with pytest.raises(ConfigError, match="holds density, yield_stress, friction_angle"):
         evaluate_store(None, tmp_path / "s.zarr", None, grids={"m": tmp_path / "slat"}, splits={})
+    words = (write_predictions(tmp_path / "p", tmp_path / "s.zarr"), "--store")
+    words = ("evaluate", *words, tmp_path / "s.zarr", "--split", "all", "--beside")
+    told = refused(*words, "pixie")
+    assert "which the scores of --beside pixie do not" in told
+    # Columns of another CSV are those of this store.
+    own = tmp_path / "own.csv"
+    own.write_text("method,log10 yield_stress,mean\nmine,0.25,0.5\n")
+    (beside,) = document(*words, own)["beside"]
+    assert beside["means"] == {"log10 yield_stress": 0.25, "mean": 0.5}
 
 
 def test_properties_next_to_the_border_of_two_labels_are_verified(tmp_path):

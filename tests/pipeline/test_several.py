@@ -9,6 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from support.commands import run
 from support.faults import inject
 from support.synthetic import Dataset, make_asset
 from support.trees import copied, records_of, tree
@@ -98,6 +99,15 @@ def own(several: Dataset, tmp_path: Path) -> Dataset:
     for side in ("pixieverse", "slat", "second", "third"):
         shutil.copytree(several.root / side, tmp_path / "own" / side)
     return Dataset(tmp_path / "own", several.assets)
+
+
+def test_what_own_grids_of_merged_assets_are_measured_on_is_told(several, merged, plain, tmp_path):
+    for name in "abc":
+        found = sorted((several.root / "pixieverse").glob(f"{name}/sample_0/material_grid.npy"))
+        shutil.copy(found[0], tmp_path / f"{name}.npy")
+    words, note = ("--split", "all", "--grids", f"m={tmp_path}", "--store"), "on the first of them"
+    assert note in run("evaluate", *words, merged.store).stderr
+    assert note not in run("evaluate", *words, plain.store).stderr
 
 
 def test_labels_are_the_mean_and_the_vote_of_all(merged, plain):
