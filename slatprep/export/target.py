@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import errno
-import glob
 import json
 import os
-import shutil
-import sys
-import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import orjson
 
 from slatprep.errors import ConfigError
+from slatprep.pipeline.work import work_beside
 from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged, writing
-from slatprep.storage.files import locks_alone
 
 FORMAT = "slatprep-export"
 FORMAT_VERSION = 1
 INDEX = "index.json"
 """Name of the file that lists the contents of an exported folder."""
-
-_NEW, _RANDOM_LETTERS = "export", 8
-"""Name of the new folder in an export's work folder, and how many letters `mkdtemp` adds."""
 
 
 @contextmanager
@@ -37,61 +28,22 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
     If `out` holds other files beside an export, only the export's files are replaced, one by one.
     ConfigError if `out` is neither empty nor an export of the same kind, or another file has the
     name of a new one.
-    SlatprepError if it cannot be written.
+    StoreError if it cannot be written, or another export is writing it.
     """
     # A link stays; its target is replaced.
     out = out.resolve()
     own = _files_of_export(out, kind) if out.exists() else frozenset()
     if own is None:
         raise _not_an_export(out, "folder")
-    with writing(str(out), out.parent):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        _remove_killed(out)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    try:
-        held = _locked(work)
-        new = work / _NEW
+    # The finished assets of an interrupted build to this path stay.
+    with work_beside(out, keep=True, who="export") as work, writing(str(out), out.parent):
+        new = work.scratch / "export"
         new.mkdir()
-        with writing(str(out), out.parent):
-            yield new
-            if out.exists() and (others := set(_names_below(out)) - own):
-                _replace_files(new, out, own, others)
-            else:
-                replace_directory(new, out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        os.close(held)
-
-
-def _locked(work: Path) -> int:
-    """Return a descriptor that locks a work folder until this process ends, however it ends.
-
-    OSError if another process holds it, or it is a link or no folder.
-    """
-    if sys.platform == "win32":
-        return os.open(os.devnull, os.O_RDONLY)
-    held = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    if not locks_alone(held):
-        os.close(held)
-        raise BlockingIOError(errno.EAGAIN, "another export is at work there", str(work))
-    return held
-
-
-def _remove_killed(out: Path) -> None:
-    """Remove the work folders of exports to `out` that were killed."""
-    if sys.platform == "win32":
-        return
-    for work in out.parent.glob(f"{glob.escape(f'.{out.name}.')}{'?' * _RANDOM_LETTERS}"):
-        with suppress(OSError):
-            held = _locked(work)
-            try:
-                state, names = os.fstat(held), [path.name for path in work.iterdir()]
-                # An empty folder may be new, and not locked yet.
-                killed = names == [_NEW] or (not names and time.time() - state.st_mtime > 60)
-                if killed and state.st_uid == os.getuid():
-                    shutil.rmtree(work, ignore_errors=True)
-            finally:
-                os.close(held)
+        yield new
+        if out.exists() and (others := set(_names_below(out)) - own):
+            _replace_files(new, out, own, others)
+        else:
+            replace_directory(new, out)
 
 
 @contextmanager

@@ -105,14 +105,15 @@ def work_beside(
     keep: bool = False,
     look: Callable[[], object] = lambda: None,
     private_disks: bool = False,
+    who: str = "build",
 ) -> Iterator[Work]:
     """Make the work folder of a target, hold its lock, and clean up.
 
     The spool keeps `arrays`, or only records. It begins empty with `fresh`, and stays after success
     with `keep`. `look` is called with the lock held, before the target is written, and raises an
     error if the target is refused. With `private_disks` workers share no disk, so the spool lies
-    at the target. StoreError if the folder cannot be written or is not a build's, or another build
-    has the lock or, with `fresh`, uses the spool; it names that build.
+    at the target. `who` works there, in a word. StoreError if the folder cannot be written or is
+    not a build's, or another one has the lock or, with `fresh`, uses the spool; it names that one.
     """
     directory = work_directory(target)
     folder, remote = directory / SPOOL, storage_of(target).remote if private_disks else None
@@ -122,7 +123,7 @@ def work_beside(
         with writing(str(target), directory.parent):
             _claim(directory)
             reached("work folder made", directory.name)
-            lock = take_lock(directory / LOCK, f"{target}: another build is writing it")
+            lock = take_lock(directory / LOCK, f"{target}: another {who} is writing it")
             reached("work folder locked", directory.name)
             _restore(directory, target)
             _remove_builds(directory)

@@ -21,7 +21,7 @@ from support.made_store import rewrite
 from support.synthetic import JELLY, METAL, QUARTER_TURN
 from support.trees import tree
 
-from slatprep.errors import ConfigError, SlatprepError
+from slatprep.errors import ConfigError, SlatprepError, StoreError
 from slatprep.export import FORMATS, ExportOptions, export_store
 from slatprep.export.target import directory
 from slatprep.learn.predictions import open_predictions
@@ -326,8 +326,8 @@ def test_hostile_ids_stay_inside_every_export(format, copy, tmp_path):
 # -- killed exports --------------------------------------------------------
 
 
-def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path):
-    out = tmp_path / "o.npz"
+def test_an_export_removes_what_a_killed_one_left_and_nothing_else(tmp_path):
+    out, work = tmp_path / "o.npz", tmp_path / ".o.npz.work"
     killed = (
         "import os, pathlib\nfrom slatprep.export.target import directory\n"
         f"with directory(pathlib.Path({str(out)!r}), 'ply') as new:\n"
@@ -335,18 +335,22 @@ def test_an_export_removes_what_killed_ones_left_and_nothing_else(tmp_path):
     )
     for _ in range(2):
         assert subprocess.run([sys.executable, "-c", killed]).returncode == -9
-    assert len(list(tmp_path.glob(".o.npz.*"))) == 1  # The second removed the first one's.
-    empty = tmp_path / ".o.npz.00000000"
-    empty.mkdir()
-    os.utime(empty, (0, 0))  # Killed before it had a lock.
-    others = [tmp_path / ".o.npz.12345678", tmp_path / ".o.npz.abc", tmp_path / ".p.npz.12345678"]
-    for folder in others:
-        (folder / "mine").mkdir(parents=True)
-    (tmp_path / ".o.npz.87654321").symlink_to(others[2])
-    with directory(out, "ply") as running, directory(out, "ply") as new:
+    assert len(list(work.glob("*/export/half"))) == 1  # The second removed the first one's.
+    finished, other = work / "spool" / "ab" / "abc.arrays", tmp_path / ".p.npz.work" / "mine"
+    finished.parent.mkdir(parents=True)
+    finished.write_bytes(b"an interrupted build's")
+    other.mkdir(parents=True)
+    told = rf"o\.npz: another export is writing it \(process {os.getpid()} on"
+    with directory(out, "ply") as new:
         (new / "a").write_text("a")
-        assert running.is_dir()  # Another export to the same place is left to end.
-        (running / "b").write_text("b")
-    assert all((folder / "mine").is_dir() for folder in others)
-    left = {path.name for path in tmp_path.iterdir()} - {"o.npz", ".o.npz.87654321"}
-    assert left == {folder.name for folder in others}
+        with pytest.raises(StoreError, match=told), directory(out, "ply"):
+            pass
+        assert new.is_dir()
+    assert [path.name for path in out.iterdir()] == ["a"]
+    assert finished.is_file() and not list(work.glob("*/export"))
+    finished.unlink()
+    shutil.rmtree(out)
+    with directory(out, "ply") as new:
+        (new / "b").write_text("b")
+    assert {path.name for path in tmp_path.iterdir()} == {"o.npz", ".p.npz.work"}
+    assert other.is_dir()
