@@ -11,35 +11,23 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
-STAGES = (
-    "slatprep.readers",
-    "slatprep.align",
-    "slatprep.sample",
-    "slatprep.judge",
+ROOMS = ("align", "geometry", "judge", "readers", "records")
+"""Rooms that the stages reach, and whose modules make an asset's numbers."""
+
+# Parameters enter an asset's key as values, so their defaults may change. Errors are words, and a
+# record only holds numbers. Digests identify bytes, however these come from a disk or a network.
+ALONE = (
+    "slatprep.normalize",
     "slatprep.pipeline.annotate",
+    "slatprep.sample",
+    "slatprep.storage.chunks",
 )
-"""Modules that make an asset's numbers; a package stands for all of its modules."""
-
-# These make no numbers. Parameters enter an asset's key as values, so their
-# defaults may change. Errors are words, and a record only holds numbers. The
-# package itself has only the version.
-_NOT_NUMBERS = (
-    "slatprep",
-    "slatprep.errors",
-    "slatprep.parameters",
-    "slatprep.store.record",
-    "slatprep.workers",
-    "slatprep.workers.local",
-)
-
-# Digests identify bytes, however these come from a disk or a network. But these
-# modules make values from bytes.
-_DECODING = ("slatprep.storage.chunks",)
+"""Modules that do so in other places."""
 
 PACKING = (
     "slatprep.normalize",
@@ -64,15 +52,13 @@ def packing_fingerprint() -> str:
 
     Rows that were packed by other code are packed anew, but their assets are not aligned again.
     """
-    return _digest_of(map(_module, PACKING))[:16]
+    return _digest_of(map(_source, PACKING))[:16]
 
 
 @lru_cache(maxsize=1)
 def code_fingerprint() -> str:
     """Return the SHA-256, in hex, of the statements of `numeric_modules`."""
-    digest = _digest_of(numeric_modules().values())
-    _parsed.cache_clear()  # Trees are large.
-    return digest
+    return _digest_of(numeric_modules().values())
 
 
 def _digest_of(modules: Iterable[Path]) -> str:
@@ -86,42 +72,24 @@ def _digest_of(modules: Iterable[Path]) -> str:
 
 
 def numeric_modules() -> dict[str, Path]:
-    """Return the modules that `STAGES` reach by imports, sorted, and their files."""
-    found: dict[str, Path] = {}
-    waiting = list(STAGES)
-    while waiting:
-        name = waiting.pop()
-        carries = name.startswith("slatprep.storage") and name not in _DECODING
-        # A name that is no module is defined in one, as in `from slatprep.records import Verdict`.
-        path = _module(name) if name in STAGES else _source(name)
-        if name in found or name in _NOT_NUMBERS or carries or path is None:
-            continue
-        found[name] = path
-        if path.name == "__init__.py":
-            waiting += [f"{name}.{module.stem}" for module in path.parent.glob("[!_]*.py")]
-        waiting += _imports(path)
+    """Return the modules of `ROOMS` and `ALONE`, sorted, and their files."""
+    found = {name: _source(name) for name in ALONE}
+    for room in ROOMS:
+        for path in _source(f"slatprep.{room}").parent.glob("*.py"):
+            found[f"slatprep.{room}.{path.stem}".removesuffix(".__init__")] = path
     return dict(sorted(found.items()))
 
 
-def _module(name: str) -> Path:
-    path = _source(name)
-    if path is None:
-        raise ValueError(f"{name} is no module of slatprep")
-    return path
-
-
-def _source(name: str) -> Path | None:
+def _source(name: str) -> Path:
     # Not by importlib, which would import and compile the package of the name.
     place = Path(__file__).parents[1].joinpath(*name.split(".")[1:])
-    files = (place.with_name(f"{place.name}.py"), place / "__init__.py")
-    return next((file for file in files if file.is_file()), None)
+    return place / "__init__.py" if place.is_dir() else place.with_name(f"{place.name}.py")
 
 
-@lru_cache(maxsize=256)
 def _parsed(text: bytes) -> ast.Module:
-    """Return a module without docstrings; the cache serves the second call."""
+    """Return a module without docstrings."""
     tree = ast.parse(text)
-    for node in _statements(tree):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
             node.body = [one for one in node.body if not _is_text(one)]
     return tree
@@ -129,23 +97,6 @@ def _parsed(text: bytes) -> ast.Module:
 
 def _is_text(statement: ast.stmt) -> bool:
     return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-
-
-def _imports(path: Path) -> Iterator[str]:
-    for node in _statements(_parsed(path.read_bytes())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("slatprep"):
-            yield node.module or ""
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name.startswith("slatprep"))
-
-
-def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield a node and every statement in it, in less time than `ast.walk` takes."""
-    yield node
-    for child in ast.iter_child_nodes(node):
-        if not isinstance(child, ast.expr):  # An expression holds no statement.
-            yield from _statements(child)
 
 
 def _dump(node: object) -> str:

@@ -140,13 +140,24 @@ def test_it_covers_every_module_that_an_asset_runs_through_and_is_the_same_elsew
     assert key == code_fingerprint()
     loaded = set(modules.split())
     # Packages that only gather names, words of errors, and values that the key holds.
-    rooms = ("geometry", "readers", "storage", "errors", "parameters")
-    uncounted = {"slatprep", *(f"slatprep.{name}" for name in rooms)}
-    # These find files, and read none.
-    finding = {f"slatprep.readers.{name}" for name in ("pairing", "joins", "slat_files")}
+    uncounted = {"slatprep", *(f"slatprep.{name}" for name in ("storage", "errors", "parameters"))}
     # Whichever way bytes come, their digests tell them.
     carrying = {name for name in loaded if name.startswith("slatprep.storage.")}
-    assert loaded - set(numeric_modules()) <= uncounted | finding | carrying
+    assert loaded - set(numeric_modules()) <= uncounted | carrying
+
+
+def test_what_it_covers_imports_nothing_else_that_makes_numbers():
+    modules = numeric_modules()
+    nodes = (node for path in modules.values() for node in ast.walk(ast.parse(path.read_bytes())))
+    found = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+    every = {name for one in found for name in (one.module, *(f"{one.module}.{alias.name}"
+             for alias in one.names)) if str(name).startswith("slatprep")}  # fmt: skip
+    # A name that is no module is defined in one.
+    there = {str(name) for name in every if fingerprint._source(str(name)).is_file()}
+    others = {name for name in there - modules.keys() if not name.startswith("slatprep.storage")}
+    # Words, values that the key holds, forms of records, and what runs tasks.
+    words = ("errors", "parameters", "store.record", "workers", "workers.local")
+    assert others <= {"slatprep", *(f"slatprep.{name}" for name in words)}
 
 
 def test_what_makes_numbers_is_in_it_and_nothing_else():
