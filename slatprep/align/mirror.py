@@ -21,8 +21,10 @@ REFLECTED = Steps(60, (3.0, 2.0, 1.0, 1.0), 0.02)
 WIDE, WIDE_STARTS, WIDE_KEPT = Steps(60, (8.0, 5.0, 3.0, 2.0), 0.02), 240, 6
 NEXT, NEXT_KEPT = Steps(200, (2.0, 1.0, 1.0, 1.0), 0.01), 2
 LAST = POLISH._replace(taus=(1.0, 1.0, 1.0))
-TRIAL_SAMPLES = 300
 """Steps of the search for a mirrored fit, with numbers of starts and of placements kept."""
+
+TRIAL_SAMPLES = 300
+"""Samples per side of the trial deformations that are compared."""
 
 
 def mirror_gain(pair: Pair, found: Similarity, poor: bool) -> float:

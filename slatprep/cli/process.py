@@ -81,7 +81,10 @@ def lost() -> str:
 
 
 def prepare_stop() -> None:
-    """Stop on SIGTERM, with which batch systems stop jobs, as on Ctrl-C, if that is not ignored."""
+    """Stop on SIGTERM, with which batch systems stop jobs, as on Ctrl-C.
+
+    A SIGINT that is ignored, as in background jobs, stays ignored.
+    """
     signal.signal(signal.SIGTERM, _stop)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)
