@@ -255,10 +255,16 @@ def align(
 
 
 def _counting(output: Output, progress: Progress) -> Progress:
-    """Return `progress` that also updates the message for a stopped build."""
+    """Return `progress` that also updates the message for a stopped build.
+
+    Assets are done from the first update with 0 done on; before, they are only compared.
+    """
+    begun = False
 
     def update(done: int, total: int) -> None:
-        if done:
+        nonlocal begun
+        begun = begun or done == 0
+        if begun and done:
             output.if_stopped = (
                 f"{done:,} of {amount(total, 'asset')} are done and kept; the same command goes on "
                 "from there"
@@ -328,6 +334,7 @@ def report(output: Output, summary: BuildSummary) -> None:
     from slatprep.readers.pairing import LOOKED_FOR
     from slatprep.records import Verdict
 
+    output.done = True
     _show_damaged(output, summary.damaged)
     looked = ""
     for asset_id, reason in summary.problems:

@@ -114,7 +114,10 @@ class LazyGroup(click.Group):
             ctx.exit(output.EXIT_INCOMPLETE)
         except KeyboardInterrupt as stop:
             kept = getattr(ctx.obj, "if_stopped", "") or "run it again to start anew"
-            say(f"\nslatprep: stopped; {str(stop) or f'nothing was replaced; {kept}'}", err=True)
+            told = f"nothing was replaced; {kept}"
+            if getattr(ctx.obj, "done", False):
+                told = "the work is done, run it again to see the result"
+            say(f"\nslatprep: stopped; {str(stop) or told}", err=True)
             ctx.exit(output.EXIT_INTERRUPTED)
         if lost():
             self._fail_unprinted(ctx)

@@ -55,7 +55,8 @@ class Output:
 
     With `as_json`, standard output is one JSON document instead of tables. `verbosity` -1 prints
     only problems, and results that go to no file; 1 prints more details. If the command is
-    stopped, `if_stopped` is printed: what is kept, and how to go on.
+    stopped, `if_stopped` is printed: what is kept, and how to go on. Once it is `done`, only the
+    printing can be stopped.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
@@ -63,6 +64,7 @@ class Output:
         self.verbosity = verbosity
         self.command = command
         self.if_stopped = ""
+        self.done = False
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
         """Print a result: the document as JSON, otherwise by `show`.
@@ -70,6 +72,7 @@ class Output:
         The document is a mapping or a dataclass. Its entries follow the command, the version and
         ``ok``, which says whether the result is `complete`. If not, exit with `EXIT_INCOMPLETE`.
         """
+        self.done = True
         if self.as_json:
             self._say_document(complete, vars(document) if is_dataclass(document) else document)
         else:

@@ -1,7 +1,8 @@
 """The command's process: its standard streams, and the signals that stop it.
 
-Texts are printed even if a stream is closed or its disk is full. A command stops even if a library
-loses the KeyboardInterrupt: Python drops an exception that a signal raises within a destructor.
+Texts are printed even if a stream is closed or its disk is full. A signal raises KeyboardInterrupt
+only where that stops the command: Python drops exceptions in destructors, and a thread of zarr
+would go on writing into a folder that is being removed.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import os
 import signal
 import sys
 from types import FrameType
-from typing import NoReturn
 
 import click
 
@@ -23,8 +23,15 @@ _broken: dict[int, str] = {}
 _untold: set[int] = set()
 """File descriptors of broken streams that lost a text."""
 
-_asked: set[int] = set()
-"""Signals that asked this process to stop."""
+_asked: list[int] = []
+"""Signals that asked this process to stop, and alarms that asked again."""
+
+_WAITING = {"asyncio", "zarr"}
+"""Packages within which no KeyboardInterrupt is raised."""
+
+_AGAIN, _MOST_AGAIN = 0.05, 200
+"""Seconds until a stop that waits is tried again, and the number of times until it waits no more.
+"""
 
 
 class OutputLostError(Exception):
@@ -93,9 +100,17 @@ def prepare_stop() -> None:
 def stop_if_asked() -> None:
     """Raise KeyboardInterrupt if a signal asked to stop."""
     if _asked:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         raise KeyboardInterrupt
 
 
-def _stop(number: int, _: FrameType | None) -> NoReturn:
-    _asked.add(number)
-    raise KeyboardInterrupt
+def _stop(number: int, frame: FrameType | None) -> None:
+    _asked.append(number)
+    while frame and len(_asked) < _MOST_AGAIN:
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if package in _WAITING or frame.f_code.co_name == "__del__":
+            signal.signal(signal.SIGALRM, _stop)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+            return
+        frame = frame.f_back
+    stop_if_asked()

@@ -188,7 +188,7 @@ def _write(
         if _same_place(source.path, place.store):
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
     _require_unclipped(new)
-    with work_beside(place.store, look=place.look) as work:
+    with place.telling_if_stopped(), work_beside(place.store, look=place.look) as work:
         pack_store(work, place, new, at_most(len(new.rows) // _ROWS_A_JOB, jobs), progress)
         sources = {str(source.path): source.normalization for source in new.stores}
         told = moved_ranges(new.normalization, sources)

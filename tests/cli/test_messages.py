@@ -257,6 +257,7 @@ def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(store, tmp_path
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monkeypatch):
     def built(*_: object, progress: Callable[[int, int], None], **__: object) -> None:
+        progress(0, 3)
         progress(2, 3)
         raise KeyboardInterrupt
 

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -78,3 +79,42 @@ def test_a_signal_at_a_step(step, number, lost, sources, tmp_path):
     assert set(folder.iterdir()) - {folder / ".s.zarr.work"} == there
     build_store(sources.parameters("pixie"), out)
     assert set(folder.iterdir()) == there
+
+
+INTERRUPTED = """
+import os, signal, time
+from slatprep.cli.process import prepare_stop
+
+def interrupted():
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(0.01)
+    print("ended")
+
+class Gone:
+    def __del__(self):
+        interrupted()
+
+library = {"__name__": "zarr.core.sync", "interrupted": interrupted}
+exec("def call(): interrupted()", library)
+prepare_stop()
+try:
+    CALL
+    time.sleep(30)
+except KeyboardInterrupt:
+    print("stopped")
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "printed"),
+    [
+        ("interrupted()", ["stopped"]),
+        # Python drops what a destructor raises, and zarr's thread would go on writing.
+        ("Gone()", ["ended", "stopped"]),
+        ("library['call']()", ["ended", "stopped"]),
+    ],
+)
+def test_a_stop_waits_where_it_would_be_lost(call, printed):
+    line = [sys.executable, "-c", INTERRUPTED.replace("CALL", call)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
+    assert (done.stdout.split(), done.stderr, done.returncode) == (printed, "", 0)
