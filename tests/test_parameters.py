@@ -160,6 +160,13 @@ def test_fault_in_an_option_names_the_option(folder):
     assert message.startswith(f"{path}: slat: ") and "table" in message
 
 
+def test_a_byte_order_mark_is_no_part_of_a_definition(folder):
+    path = write(folder, MINIMAL)
+    marked = folder / "marked.toml"
+    marked.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert load_parameters(marked) == load_parameters(path)
+
+
 def test_what_is_no_definition_is_named(folder):
     path = write(folder, MINIMAL + "[align\n")
     message = message_of(path)

@@ -275,4 +275,4 @@ def describe(
         return
     with new_file(out) as path:
         path.write_text(text, encoding="utf-8")
-    output.note(f"description: {out}")
+    output.made({"out": out}, lambda: output.note(f"description: {out}"))

@@ -163,7 +163,7 @@ class _Origin(NamedTuple):
 def _read(path: Path) -> dict[str, Any]:
     """Return the content of a file, its paths resolved against its folder."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         fault = next(_faults_in(data), None)
     except tomllib.TOMLDecodeError as error:
         # tomllib's own message ends with the line and column.

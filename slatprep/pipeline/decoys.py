@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -224,7 +226,10 @@ def measure_errors(
 
     if reason := _no_decoys(store):
         raise StoreError(f"{store.path}: {reason}")
-    writable_file(store.path)
+    if (file := storage_of(writable_file(store.path)).local) is not None:
+        there = next(one for one in file.parents if one.exists())
+        if not os.access(there, os.W_OK):
+            raise StoreError(f"{there}: cannot be written to; expected a folder for {file}")
     keys, grids, evidence = _evidence_of(store)
     wanted = draw_decoys(store, keys, grids, decoys, seed)
     if not wanted:
@@ -404,11 +409,20 @@ def measured_errors(store: Place) -> MeasuredErrors | None:
 
 
 def errors_of(store: Store) -> MeasuredErrors | None:
-    """Return the last measurement of a store if any of the assets are still there, else None."""
+    """Return the last measurement of a store if any of its decoys is still one, else None."""
     measured = measured_errors(store.path)
-    if measured and measured.decoys and not any(one.grid in store for one in measured.decoys):
-        return None  # Another dataset lay at this place.
-    return measured
+    if measured is None or not measured.decoys or measured.build == store.about.manifest:
+        return measured
+    records = StoredRecords(store)
+
+    def key_of(asset_id: str) -> str:
+        with suppress(StoreError):  # It is not there, or damaged.
+            return records.of(asset_id).key
+        return ""
+
+    still = any(one.keys == (key_of(one.grid), key_of(one.slat)) for one in measured.decoys)
+    # Otherwise another dataset lay at this place, or all assets were aligned with other parameters.
+    return measured if still else None
 
 
 def told_of(store: Store) -> list[str]:

@@ -162,7 +162,8 @@ def writing(what: str, where: Place) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        # numpy gives no number if a disk takes only a part of an array.
+        full = error.errno in (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         advice = "Make room there" if full else "Name a place that may be written"
         raise StoreError(
             f"{what}: cannot be written to {where} ({error.strerror or error}); nothing was "

@@ -112,6 +112,13 @@ def test_a_card_says_what_is_known_and_what_is_not(mixed_build):
     assert "```\n'''me\n```" in linked
 
 
+def test_a_description_in_a_file_is_told_as_json(store, tmp_path):
+    out = tmp_path / "s.json"
+    told = commands.document("describe", store, "--out", out)
+    assert (told["command"], told["out"], told["ok"]) == ("describe", str(out), True)
+    assert json.loads(out.read_text())["@type"] == "sc:Dataset"
+
+
 def test_no_category_is_a_control_character_or_the_row_of_all(copy):
     word = "cup\x1b[2J\x9b\u202e\n"
     rewrite(copy, "asset/category", slice(0, 2), np.array([word, "all"], object))

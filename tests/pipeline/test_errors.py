@@ -1,6 +1,8 @@
 """Decoys of a real store: drawn by ids and size, aligned once, with builds too, told in words."""
 
 import json
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 from support.commands import run
 from support.trees import copied, tree
 
+from slatprep.errors import StoreError
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
@@ -76,6 +79,13 @@ def test_pairs_that_share_a_slat_or_a_grid_are_no_decoys(make_dataset, tmp_path)
     run("subset", out, "--asset", "a", "--asset", "b", "--out", tmp_path / "two.zarr")
     said = run("measure-errors", tmp_path / "two.zarr", code=1).output
     assert "decoys need two objects that share neither grid nor SLAT" in said
+
+
+def test_a_disk_that_cannot_be_written_is_told_before_decoys_are_aligned(store, monkeypatch):
+    monkeypatch.setattr(decoys, "align_decoy", None)
+    monkeypatch.setattr("os.access", lambda path, mode: mode != os.W_OK)  # As on a read-only disk.
+    with pytest.raises(StoreError, match=r"cannot be written to; expected a folder for .*decoys"):
+        measure_errors(store)
 
 
 def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
@@ -226,6 +236,12 @@ def test_a_small_update_measures_nothing_and_a_larger_one_takes_decoys_over(make
     assert store.column("verdict").tolist()[:-1] == verdicts
     assert (manifests_of(out) / ERRORS).read_bytes() == text
     assert told_of(store)[-1].startswith("measured before the last update, when there were 6")
+    other = dataset.parameters(align={"radius": 2.0})
+    other_store = tmp_path / "other.zarr"
+    shutil.copytree(out, other_store)
+    shutil.copytree(manifests_of(out), manifests_of(other_store))
+    build_store(other, other_store, decoys=0)
+    assert told_of(open_store(other_store))[0].startswith("not measured; ")
     for seed, name in enumerate(("hen", "ibis"), 8):
         dataset.add(name, seed)
     build_store(dataset.parameters(), out)

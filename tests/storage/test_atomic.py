@@ -15,6 +15,12 @@ from slatprep.storage import atomic
 from slatprep.storage.atomic import staged, take_lock, writing
 
 
+def test_a_write_that_a_disk_takes_in_part_is_told_as_a_full_disk():
+    part = "1048576 requested and 480224 written"  # What numpy says; it gives no number.
+    with pytest.raises(StoreError, match=f"{part}.*Make room there"), writing("x", Path("disk")):
+        raise OSError(part)
+
+
 def directory(path: Path, content: str) -> Path:
     path.mkdir()
     (path / "file").write_text(content)
