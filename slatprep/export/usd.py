@@ -8,7 +8,9 @@ usd-core is needed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -102,7 +104,8 @@ def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]])
         # A second operation: that of the asset's file lifts it onto the ground.
         place = one.AddTranslateOp(opSuffix="place")
         place.Set(tuple(float(_PITCH * size * step) for step in (column, row, 0)))
-    stage.GetRootLayer().Save()
+    with _disk_errors():
+        stage.GetRootLayer().Save()
     return [SCENE]
 
 
@@ -146,7 +149,8 @@ def _write_asset(
         for number, material in enumerate(binned.material):
             _add_material(stage, binding, number, int(material), solid, binned)
         binding.SetMaterialBindSubsetsFamilyType(geom.Tokens.nonOverlapping)
-    stage.GetRootLayer().Save()
+    with _disk_errors():
+        stage.GetRootLayer().Save()
 
 
 def _add_material(
@@ -200,10 +204,23 @@ def _simulation(stage: Any, parent: str, width: float) -> None:
     physics.CollisionAPI.Apply(ground.GetPrim())
 
 
+@contextmanager
+def _disk_errors() -> Iterator[None]:
+    """Turn an error of USD into an OSError, as the disk did not take a file."""
+    (tf,) = _pxr("Tf")
+    try:
+        yield
+    except tf.ErrorException as error:
+        # It has a line for each block, all with the same reason.
+        reason = re.search(r"writing file: ([^'\n]+)", str(error))
+        raise OSError(reason[1] if reason else str(error)) from None
+
+
 def _stage(path: Path, name: str) -> tuple[Any, Any]:
     """Return a new stage in metres and kilograms, z up, and its root of that name."""
     usd, geom, physics = _pxr("Usd", "UsdGeom", "UsdPhysics")
-    stage = usd.Stage.CreateNew(str(path))
+    with _disk_errors():
+        stage = usd.Stage.CreateNew(str(path))
     geom.SetStageMetersPerUnit(stage, 1.0)
     physics.SetStageKilogramsPerUnit(stage, 1.0)
     geom.SetStageUpAxis(stage, geom.Tokens.z)

@@ -197,7 +197,8 @@ def test_a_file_of_another_origin_is_not_replaced(store, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["index.json", "latents", "metadata.csv"]
 
 
-def test_a_disk_that_is_full_ends_no_process(store, tmp_path):
+@pytest.mark.parametrize("format", ["hdf5", "usd"])
+def test_a_disk_that_is_full_ends_no_process(format, store, tmp_path):
     """A limit on the size of files refuses writes as a full disk does; HDF5 crashes of either."""
     code = (
         "import os, resource, signal, sys\n"
@@ -207,10 +208,10 @@ def test_a_disk_that_is_full_ends_no_process(store, tmp_path):
         "hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]\n"
         "for allowed in (1, 3000, 40_000, 100_000):\n"
         "    resource.setrlimit(resource.RLIMIT_FSIZE, (allowed, hard))\n"
-        "    try: export_store(sys.argv[1], sys.argv[2] + '/e.h5', 'hdf5')\n"
+        "    try: export_store(sys.argv[1], sys.argv[2] + '/e', sys.argv[3])\n"
         "    except SlatprepError as error: print(error, os.listdir(sys.argv[2]))\n"
     )
-    command = [sys.executable, "-c", code, str(store), str(tmp_path)]
+    command = [sys.executable, "-c", code, str(store), str(tmp_path), format]
     told = subprocess.run(command, capture_output=True, text=True, check=True)
     lines = told.stdout.splitlines()
     assert len(lines) == 4
