@@ -197,19 +197,21 @@ def one_grid(
         looked = tried_names(tried, {"id": object_id})
         raise InputError(root, f"no grid for id {object_id!r}", f"one of {looked}")
     if len(found) > 1:
-        raise InputError(root, several_grids(object_id, list(found)), "one grid of every object")
+        raise InputError(root, several_grids(object_id, found, ""), "one grid of every object")
     if found[0].problem:
         raise InputError(root, found[0].problem, "a grid")
     return root / found[0].path
 
 
-def several_grids(object_id: str, grids: Sequence[FoundField]) -> str:
-    """Say that an object has several grids, and what to do."""
+_CHOOSE = (
+    "; choose one with `sample` in the table [pixieverse] of the dataset definition, or say with "
+    "--samples what becomes of them: first, all or merge"
+)
+
+
+def several_grids(object_id: str, grids: Sequence[FoundField], samples: str = _CHOOSE) -> str:
+    """Say that an object has several grids, and what to do if they are `samples`."""
     files = ", ".join(grid.path for grid in grids)
     if len({grid.sample for grid in grids}) > 1:
-        return (
-            f"id {object_id!r} has {len(grids)} samples ({files}); choose one with `sample` in the "
-            "table [pixieverse] of the dataset definition, or say with --samples what becomes of "
-            "them: first, all or merge"
-        )
+        return f"id {object_id!r} has {len(grids)} samples ({files}){samples}"
     return f"{len(grids)} grids for one id {object_id!r} ({files}); expected one"

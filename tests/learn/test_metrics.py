@@ -426,6 +426,7 @@ def test_a_bad_grid_is_named_and_the_rest_goes_on(case, tmp_path, fault):
     command = ("evaluate", "--store", case.store, "--split", "all", "--grids", results, "--json")
     done = run(*command, code=1)
     assert words in done.stderr and str(results) in done.stderr
+    assert "--samples" not in done.stderr  # An option of builds alone.
     document = json.loads(done.stdout)
     assert {m["objects"] for m in document["methods"].values()} == {len(NAMES) - 1}
     assert len(document["problems"]) == 1
