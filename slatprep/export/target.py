@@ -12,8 +12,8 @@ from typing import Any
 import orjson
 
 from slatprep.errors import ConfigError
-from slatprep.pipeline.work import work_beside
 from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged, writing
+from slatprep.storage.work import scratch_beside
 
 FORMAT = "slatprep-export"
 FORMAT_VERSION = 1
@@ -36,8 +36,8 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
     if own is None:
         raise _not_an_export(out, "folder")
     # The finished assets of an interrupted build to this path stay.
-    with work_beside(out, keep=True, who="export") as work, writing(str(out), out.parent):
-        new = work.scratch / "export"
+    with scratch_beside(out, "export") as scratch, writing(str(out), out.parent):
+        new = scratch / "export"
         new.mkdir()
         yield new
         if out.exists() and (others := set(_names_below(out)) - own):

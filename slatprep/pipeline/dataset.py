@@ -43,11 +43,12 @@ from slatprep.pipeline.recipe import Wanted, recipe_of
 from slatprep.pipeline.rows import NextStore, Row
 from slatprep.pipeline.settle import check_objects, kept_rows, settle_rows
 from slatprep.pipeline.spool import Spool
-from slatprep.pipeline.work import spool_of, work_beside, work_directory
+from slatprep.pipeline.work import spool_of, work_beside
 from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Normalization, Place
 from slatprep.storage.atomic import staged, writing
+from slatprep.storage.work import work_directory
 from slatprep.store.reader import require_outside
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json

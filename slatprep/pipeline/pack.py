@@ -21,7 +21,7 @@ from slatprep.normalize import (
 from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.rows import NextStore, SourceStore, Where, record_text
 from slatprep.pipeline.spool import Spool
-from slatprep.pipeline.work import Work, work_directory
+from slatprep.pipeline.work import Work
 from slatprep.records import UNANNOTATED, Normalization, Place
 from slatprep.storage.atomic import writing
 from slatprep.storage.faults import reached
@@ -29,6 +29,7 @@ from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import put_objects
 from slatprep.storage.upload import Staged
+from slatprep.storage.work import work_directory
 from slatprep.store.integrity import open_for_writing
 from slatprep.store.layout import ARRAYS, RECORD_ARRAY, arrays_with, edges_of, overlaps
 from slatprep.store.runs import Run, Runs, runs_of
