@@ -16,7 +16,7 @@ def main() -> None:
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
     os.environ["MPLBACKEND"] = "Agg"  # All pictures are files, and matplotlib fails at other names.
-    from slatprep.cli.process import prepare_stop, prepare_streams
+    from slatprep.cli.process import ignore_stops, prepare_stop, prepare_streams
 
     prepare_stop()
     prepare_streams()
@@ -26,6 +26,12 @@ def main() -> None:
             "PYTHONOPTIMIZE=2 leave out; expected -O at most\n"
         )
         raise SystemExit(2)
-    from slatprep.cli.commands import slatprep
+    try:
+        from slatprep.cli.commands import slatprep
 
-    slatprep(prog_name="slatprep")
+        slatprep(prog_name="slatprep")
+    except KeyboardInterrupt:  # While modules were imported.
+        sys.stderr.write("slatprep: stopped; nothing was replaced\n")
+        raise SystemExit(130) from None
+    finally:
+        ignore_stops()

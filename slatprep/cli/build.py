@@ -266,8 +266,8 @@ def _counting(output: Output, progress: Progress) -> Progress:
         begun = begun or done == 0
         if begun and done:
             output.if_stopped = (
-                f"{done:,} of {amount(total, 'asset')} are done and kept; the same command goes on "
-                "from there"
+                f"nothing was replaced; {done:,} of {amount(total, 'asset')} are done and kept; "
+                "the same command goes on from there"
             )
         progress(done, total)
 

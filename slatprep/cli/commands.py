@@ -113,8 +113,7 @@ class LazyGroup(click.Group):
             say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
             ctx.exit(output.EXIT_INCOMPLETE)
         except KeyboardInterrupt as stop:
-            kept = getattr(ctx.obj, "if_stopped", "") or "run it again to start anew"
-            told = f"nothing was replaced; {kept}"
+            told = getattr(ctx.obj, "if_stopped", "") or output.NOTHING_REPLACED
             if getattr(ctx.obj, "done", False):
                 told = "the work is done, run it again to see the result"
             say(f"\nslatprep: stopped; {str(stop) or told}", err=True)

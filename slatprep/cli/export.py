@@ -130,6 +130,7 @@ def export(
         verdicts = USABLE
     if split != "all":
         assets = tuple(opened.ids[row] for row in rows)
+    output.if_stopped = f"{out} holds files of the old export, the new one, or both; run it again"
     with output.progress("export") as progress:
         summary = export_store(
             opened,

@@ -17,7 +17,7 @@ from slatprep.cli import options
 from slatprep.cli.latents import Standardised
 from slatprep.cli.output import Cell, Output
 from slatprep.cli.signature import Click, command
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, amount
 
 if TYPE_CHECKING:
     from slatprep.extract import Session
@@ -164,7 +164,8 @@ def train(
     summaries = {}
     for name, directory in runs.items():
         output.if_stopped = (
-            "the same command goes on from the last checkpoint, at most 30 s and a step ago"
+            "the same command goes on from the last checkpoint, if there is one; while an epoch "
+            "runs, one is written every 30 s"
         )
         with (
             writing(str(directory), directory.parent),
@@ -314,6 +315,10 @@ def predict(
                 read.leave_out(error)
             else:
                 counts["predicted"] += 1
+                output.if_stopped = (
+                    f"{amount(counts['predicted'], 'prediction')} in {out} are new; run it again "
+                    "to make all"
+                )
                 counts["voxels"] += len(field.coords)
             seconds["write"] += time.perf_counter() - begin
             seconds["decode"] += field.seconds

@@ -36,6 +36,9 @@ EXIT_CODES = {
 }
 """Meaning of each exit code, for every command."""
 
+NOTHING_REPLACED = "nothing was replaced; run it again to start anew"
+"""Text of a stopped command that has not said anything else."""
+
 Cell = str | int | float | bool | None
 
 _STYLES = {"good": "green", "doubtful": "yellow", "failed": "red"}
@@ -55,15 +58,15 @@ class Output:
 
     With `as_json`, standard output is one JSON document instead of tables. `verbosity` -1 prints
     only problems, and results that go to no file; 1 prints more details. If the command is
-    stopped, `if_stopped` is printed: what is kept, and how to go on. Once it is `done`, only the
-    printing can be stopped.
+    stopped, `if_stopped` is printed: what was replaced or kept, and how to go on. Once it is
+    `done`, only the printing can be stopped.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
         self.as_json = as_json
         self.verbosity = verbosity
         self.command = command
-        self.if_stopped = ""
+        self.if_stopped = NOTHING_REPLACED
         self.done = False
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
@@ -175,6 +178,9 @@ def new_file(file: Path) -> Iterator[Path]:
 
     with writing(str(file), file.parent), staged(file) as path:
         yield path
+    context = click.get_current_context(silent=True)
+    if context is not None and isinstance(context.obj, Output):
+        context.obj.if_stopped = f"{file} is new; run it again to make all"
 
 
 def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -104,6 +104,13 @@ def stop_if_asked() -> None:
         raise KeyboardInterrupt
 
 
+def ignore_stops() -> None:
+    """Ignore signals from now on, as the command has ended, and Python ends by itself."""
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGALRM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def _stop(number: int, frame: FrameType | None) -> None:
     _asked.append(number)
     while frame and len(_asked) < _MOST_AGAIN:

@@ -37,6 +37,8 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
         raise _not_an_export(out, "folder")
     # The finished assets of an interrupted build to this path stay.
     with scratch_beside(out, "export") as scratch, writing(str(out), out.parent):
+        # Another export may have ended here before this one had the lock.
+        own = (own and _files_of_export(out, kind)) or frozenset()
         new = scratch / "export"
         new.mkdir()
         yield new
@@ -103,7 +105,8 @@ def _names_below(directory: Path) -> Iterator[str]:
 def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) -> None:
     """Replace the files of an old export by those of a new one; keep all other files."""
     names = sorted(_names_below(new), key=lambda name: (name == INDEX, name))
-    if taken := sorted(others.intersection(names)):
+    folders = {name for name in names if (out / name).is_dir() and not (new / name).is_dir()}
+    if taken := sorted(others.intersection(names) | folders):
         raise ConfigError(
             f"{out / taken[0]} is of no export of slatprep, and the new export has a "
             "file of this name; move it away, or export to a new path"

@@ -8,6 +8,8 @@ usd-core is needed.
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -212,8 +214,9 @@ def _disk_errors() -> Iterator[None]:
         yield
     except tf.ErrorException as error:
         # It has a line for each block, all with the same reason.
-        reason = re.search(r"writing file: ([^'\n]+)", str(error))
-        raise OSError(reason[1] if reason else str(error)) from None
+        reason = next(iter(re.findall(r" : '(?:.*writing file: )?([^'\n]+)", str(error))), "")
+        full = (n for n in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(n) in reason)
+        raise OSError(next(full, errno.EIO), reason or "USD did not say why") from None
 
 
 def _stage(path: Path, name: str) -> tuple[Any, Any]:

@@ -126,9 +126,11 @@ def evaluate_store(
     id>/sample_<k>/material_grid.npy`` or ``<object id>.npy``. Split and filters are those of
     `slatprep.learn.splits.select_assets`. An asset without a usable prediction of every method is
     left out of all and named. InputError if none is left; ConfigError if grids are given and the
-    store holds other properties or classes, or there is no such spread.
+    store holds other properties or classes, or nothing or no such spread is asked for.
     """
     require_one_of("spread", spread, tuple(SPREADS))
+    if predictions is None and not grids:
+        raise ConfigError("nothing to measure; give predictions, grids, or both")
     store, grids = open_store(store_path), grids or {}
     if grids:
         require_pixieverse(store, "grids of Pixie's form")
@@ -167,9 +169,8 @@ def evaluate_store(
                 partly.add(object_id)
     problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
     if not scored:
-        places = [*filter(None, [predictions, *grids.values()]), store.path]
-        alone = predictions is not None and not grids
-        raise _nothing_scored(places[0], alone, f"split {split or 'all'}", problems, missing)
+        place = predictions or next(iter(grids.values()))
+        raise _nothing_scored(place, not grids, f"split {split or 'all'}", problems, missing)
     names = [OURS] if predictions else []
     names += [f"{name}, {where}" for name in grids for where in ("SLAT voxels", "own grid")]
     names += [one.name for one in baselines]

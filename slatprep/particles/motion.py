@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import ConfigError
 from slatprep.geometry.voxels import filled, occupancy_of, shown_in_cells
 from slatprep.particles import gaussians as splats
 from slatprep.particles.fields import VoxelField
@@ -17,6 +18,9 @@ from slatprep.particles.transfer import doubt_axes, recognise_axes, transfer
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, Place
 from slatprep.storage.atomic import staged
 from slatprep.store import open_store
+
+_HEADER = 4_096
+"""Bytes of a frame that hold its comments."""
 
 CLASSES = MATERIAL_CLASSES[:BACKGROUND]
 
@@ -113,7 +117,8 @@ def run(
     from slatprep.particles.simulate import preferred_device, simulate_motion
 
     windy = wind != 0
-    foot = scene.positions[:, 2] < scene.positions[:, 2].min() + 1.5 * scene.spacing
+    heights = scene.positions[:, 2]
+    foot = heights < heights.min(initial=np.inf) + 1.5 * scene.spacing
     moved = simulate_motion(
         scene.positions * size,
         scene.material,
@@ -142,12 +147,22 @@ def write_frames(
 ) -> int:
     """Write ``frame-0000.ply`` and so on, and the picture; return the number of frames.
 
-    Frames that an earlier run left in `out` are removed.
+    Frames that an earlier run left in `out` are removed. ConfigError if another file has such a
+    name.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for old in out.glob("frame-*.ply"):  # An earlier run may have more frames.
-        if old.stem.removeprefix("frame-").isdigit():
-            old.unlink()
+    frames_before = [
+        old for old in out.glob("frame-*.ply") if old.stem.removeprefix("frame-").isdigit()
+    ]
+    for old in frames_before:  # An earlier run may have more frames.
+        with old.open("rb") as file:
+            head = file.read(_HEADER)
+            if not any(line.encode() in head for line in FRAMES.values()):
+                raise ConfigError(
+                    f"{old} is no frame of slatprep; move it away, or choose another --out"
+                )
+    for old in frames_before:
+        old.unlink()
     carrier = splats.bind(scene.places, scene.positions, scene.spacing)
     low = moved[0].min(axis=(0, 1)) - scene.spacing
     high = moved[0].max(axis=(0, 1)) + scene.spacing

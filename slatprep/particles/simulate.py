@@ -149,7 +149,7 @@ def _check(
     positions: NDArray[np.float64], material: NDArray[np.int_], properties: NDArray[np.float64]
 ) -> None:
     if len(positions) == 0:
-        raise SlatprepError("there are no particles to simulate")
+        raise SlatprepError("there are no particles to simulate; raise --particles")
     others = sorted(set(material.tolist()) - set(YIELDING))
     if others:
         name = dict(enumerate(MATERIAL_CLASSES)).get(others[0], "unknown")

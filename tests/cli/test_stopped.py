@@ -118,3 +118,45 @@ def test_a_stop_waits_where_it_would_be_lost(call, printed):
     line = [sys.executable, "-c", INTERRUPTED.replace("CALL", call)]
     done = subprocess.run(line, capture_output=True, text=True, timeout=60)
     assert (done.stdout.split(), done.stderr, done.returncode) == (printed, "", 0)
+
+
+ENDING = """
+import atexit, os, signal, sys
+from slatprep.cli import main
+
+def end():
+    os.kill(os.getpid(), signal.SIGNAL)
+    print("ended", file=sys.stderr)
+
+atexit.register(end)
+sys.argv = ["slatprep", "info", "--help"]
+main()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
+def test_a_signal_while_python_ends_changes_nothing(name):
+    line = [sys.executable, "-c", ENDING.replace("SIGNAL", name)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
+    assert (done.stderr, done.returncode) == ("ended\n", 0)
+
+
+STARTING = """
+import os, signal, sys
+from slatprep.cli import main
+
+class Interrupts:
+    def find_spec(self, name, *_):
+        if name == "slatprep.cli.commands":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+sys.meta_path.insert(0, Interrupts())
+main()
+"""
+
+
+def test_a_signal_while_modules_are_imported_is_told_in_a_line():
+    line = [sys.executable, "-c", STARTING]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
+    assert done.stderr == "slatprep: stopped; nothing was replaced\n"
+    assert done.returncode in (130, -signal.SIGINT)

@@ -193,6 +193,13 @@ def test_a_file_of_another_origin_is_not_replaced(store, tmp_path):
         export_store(store, out, "npz", assets=["dog"])
     assert (folder / "dog.npz").read_text() == "mine"
     assert (out / "index.json").read_bytes() == before
+    (folder / "cup.npz").unlink()
+    (folder / "cup.npz").mkdir()  # A folder where the old export had a file.
+    with pytest.raises(ConfigError, match=r"cup\.npz is of no export of slatprep"):
+        export_store(store, out, "npz", assets=["cup"])
+    assert (out / "index.json").read_bytes() == before
+    (folder / "cup.npz").rmdir()
+    (folder / "cup.npz").touch()
     assert sorted(path.name for path in folder.iterdir()) == ["cup.npz", "dog.npz"]
     assert sorted(path.name for path in out.iterdir()) == ["index.json", "latents", "metadata.csv"]
 

@@ -485,6 +485,8 @@ def test_nothing_in_common_is_an_error(case, tmp_path):
     grids = {"m": tmp_path}
     with pytest.raises(InputError, match=r"every method .*no grid for id 'a'"):
         evaluate_store(ours, case.store, None, grids=grids, splits={})
+    with pytest.raises(ConfigError, match="nothing to measure"):
+        evaluate_store(None, case.store, None)
     with pytest.raises(ConfigError, match="spread is 'sdev'"):
         evaluate_store(ours, case.store, None, "sdev")  # type: ignore[arg-type]
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from support.commands import document, run
 from support.synthetic import JELLY, METAL, make_asset
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import ConfigError, SlatprepError
 from slatprep.particles import gaussians, motion
 from slatprep.particles.fields import VoxelField
 from slatprep.particles.read import SAVED_AXES
@@ -321,6 +321,16 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path):
         (out / "frame-0001-mine.ply").touch()
     names = sorted(path.name for path in out.iterdir())
     assert names == ["frame-0000.ply", "frame-0001-mine.ply", "frame-0001.ply"]
+    (out / "frame-2024.ply").write_text("mine")
+    with pytest.raises(ConfigError, match=r"frame-2024\.ply is no frame of slatprep"):
+        motion.write_frames(out, scene, (moved, gradients), 30, None, False, lambda *_: None)
+    assert sorted(path.name for path in out.iterdir()) == [*names, "frame-2024.ply"]
+
+
+def test_an_object_without_a_particle_is_told_in_words():
+    nothing = motion.Scene(np.zeros((0, 3)), 1.0, *[np.zeros(0)] * 4, "slat", ())  # type: ignore[arg-type]
+    with pytest.raises(SlatprepError, match="no particles to simulate; raise --particles"):
+        motion.run(nothing, size=1.0, height=0.1, wind=0.0, device="cpu", seconds=0.1)
 
 
 @needs_newton
