@@ -90,8 +90,11 @@ def lost() -> str:
 def prepare_stop() -> None:
     """Stop on SIGTERM, with which batch systems stop jobs, as on Ctrl-C.
 
-    A SIGINT that is ignored, as in background jobs, stays ignored.
+    A SIGINT that is ignored, as in background jobs, stays ignored. On Windows, which has no alarms,
+    everything stays as Python has it.
     """
+    if sys.platform == "win32":
+        return
     signal.signal(signal.SIGTERM, _stop)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)
@@ -106,6 +109,8 @@ def stop_if_asked() -> None:
 
 def ignore_stops() -> None:
     """Ignore signals from now on, as the command has ended, and Python ends by itself."""
+    if sys.platform == "win32":
+        return
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGALRM):
         signal.signal(number, signal.SIG_IGN)
