@@ -32,13 +32,11 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
     """
     # A link stays; its target is replaced.
     out = out.resolve()
-    own = _files_of_export(out, kind) if out.exists() else frozenset()
-    if own is None:
-        raise _not_an_export(out, "folder")
     # The finished assets of an interrupted build to this path stay.
     with scratch_beside(out, "export") as scratch, writing(str(out), out.parent):
-        # Another export may have ended here before this one had the lock.
-        own = (own and _files_of_export(out, kind)) or frozenset()
+        own = _files_of_export(out, kind) if out.exists() else frozenset()
+        if own is None:
+            raise _not_an_export(out, "folder")
         new = scratch / "export"
         new.mkdir()
         yield new

@@ -7,6 +7,8 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from support.synthetic import JELLY, METAL, QUARTER_TURN
 from support.trees import tree
 
 from slatprep.errors import ConfigError, SlatprepError, StoreError
-from slatprep.export import FORMATS, ExportOptions, export_store
+from slatprep.export import FORMATS, ExportOptions, export_store, target
 from slatprep.export.target import directory
 from slatprep.learn.predictions import open_predictions
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
@@ -362,3 +364,23 @@ def test_an_export_removes_what_a_killed_one_left_and_nothing_else(tmp_path):
         (new / "b").write_text("b")
     assert {path.name for path in tmp_path.iterdir()} == {"o.npz", ".p.npz.work"}
     assert other.is_dir()
+
+
+def test_an_export_looks_what_it_replaces_once_it_has_the_lock(tmp_path, monkeypatch):
+    out, locked = tmp_path / "o", target.scratch_beside
+
+    def export(name: str) -> None:
+        with directory(out, "ply") as new:
+            (new / name).touch()
+            target.write_index(new, {"format": target.FORMAT, "kind": "ply"}, [{"file": name}])
+
+    @contextmanager
+    def late(place: Path, who: str) -> Iterator[Path]:
+        monkeypatch.undo()
+        export("a")  # Another one that ends just before.
+        with locked(place, who) as scratch:
+            yield scratch
+
+    monkeypatch.setattr(target, "scratch_beside", late)
+    export("b")
+    assert sorted(path.name for path in out.iterdir()) == ["b", "index.json"]
