@@ -12,7 +12,7 @@ import click
 
 from slatprep.cli import options
 from slatprep.cli.info import show_errors, show_quality
-from slatprep.cli.output import Output, say
+from slatprep.cli.output import DONE, Output, say
 from slatprep.cli.signature import Click, command
 from slatprep.errors import amount
 from slatprep.workers import Progress
@@ -334,7 +334,7 @@ def report(output: Output, summary: BuildSummary) -> None:
     from slatprep.readers.pairing import LOOKED_FOR
     from slatprep.records import Verdict
 
-    output.done = True
+    output.if_stopped = DONE
     _show_damaged(output, summary.damaged)
     looked = ""
     for asset_id, reason in summary.problems:

@@ -113,10 +113,8 @@ class LazyGroup(click.Group):
             say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
             ctx.exit(output.EXIT_INCOMPLETE)
         except KeyboardInterrupt as stop:
-            told = getattr(ctx.obj, "if_stopped", "") or output.NOTHING_REPLACED
-            if getattr(ctx.obj, "done", False):
-                told = "the work is done, run it again to see the result"
-            say(f"\nslatprep: stopped; {str(stop) or told}", err=True)
+            told = str(stop) or getattr(ctx.obj, "if_stopped", output.NOTHING_REPLACED)
+            say(f"\nslatprep: stopped; {told}", err=True)
             ctx.exit(output.EXIT_INTERRUPTED)
         if lost():
             self._fail_unprinted(ctx)
@@ -125,7 +123,7 @@ class LazyGroup(click.Group):
     def _fail_unprinted(self, ctx: click.Context) -> NoReturn:
         """Print on the remaining stream that the result could not be printed."""
         if not lost().startswith("standard error") or "--json" not in sys.argv:
-            told = f"slatprep: error: {lost()}; the work is done, run it again to see the result"
+            told = f"slatprep: error: {lost()}; {output.DONE}"
             say(told, err="standard output" in lost())
         ctx.exit(output.EXIT_UNPRINTED)
 

@@ -120,7 +120,7 @@ def evaluate(
         some = f"{', '.join(result.classless[:3])} ({len(result.classless)} in all; --json)"
         output.note(f"note:    predictions without a class, not in the accuracy: {some}")
     if csv_file is not None:
-        _write_scores(csv_file, what, measures, spread)
+        _write_scores(output, csv_file, what, measures, spread)
     if picture is not None:
         options.draw_to(output, picture, partial(draw_comparison, measures, SPREADS[spread]))
 
@@ -201,14 +201,16 @@ def _folders_of_grids(grids: tuple[str, ...]) -> dict[str, Path]:
     return folders
 
 
-def _write_scores(file: Path, what: str, measures: Mapping[str, Measure], spread: str) -> None:
+def _write_scores(
+    output: Output, file: Path, what: str, measures: Mapping[str, Measure], spread: str
+) -> None:
     metrics = next(iter(measures.values())).means
     names = (name for mean in metrics for name in (mean, f"{mean} {spread}"))
     rows = (
         (name, m.objects, *(s[key] for key in metrics for s in (m.means, m.spreads)))
         for name, m in measures.items()
     )
-    write_csv(file, (what, "objects", *names), rows)
+    write_csv(output, file, (what, "objects", *names), rows)
 
 
 def _show_beside(

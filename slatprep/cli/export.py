@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from slatprep.cli import options
-from slatprep.cli.output import Output, new_file, say
+from slatprep.cli.output import Output, say
 from slatprep.cli.signature import Click, command
 from slatprep.errors import ConfigError
 from slatprep.storage.place import storage_of
@@ -274,6 +274,6 @@ def describe(
     if out is None:
         say(text, nl=False)
         return
-    with new_file(out) as path:
+    with output.new_file(out) as path:
         path.write_text(text, encoding="utf-8")
     output.made({"out": out}, lambda: output.note(f"description: {out}"))

@@ -293,7 +293,7 @@ def stats(
             opened, **vars(chosen), weight=weight, jobs=jobs, progress=progress
         )
     if csv_file is not None:
-        write_csv(csv_file, COLUMNS, table_of(found))
+        write_csv(output, csv_file, COLUMNS, table_of(found))
     if picture is not None:
         from slatprep.inspect.pictures.statistics import draw_statistics
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import click
 
-from slatprep.cli.output import Output, new_file
+from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, NewPath
 from slatprep.errors import amount, tally
 from slatprep.storage.place import place_of, storage_of
@@ -162,7 +162,7 @@ DrawnFile = Annotated[NewFile, Click(metavar="FILE.png|svg|pdf", callback=_drawa
 
 def draw_to(output: Output, picture: Path, draw: Callable[[str], bytes]) -> None:
     """Write the picture that `draw` returns for the format in the file's name."""
-    with new_file(picture) as path:
+    with output.new_file(picture) as path:
         path.write_bytes(draw(picture.suffix[1:].lower()))
     output.note(f"picture: {picture}")
 

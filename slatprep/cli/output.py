@@ -37,7 +37,8 @@ EXIT_CODES = {
 """Meaning of each exit code, for every command."""
 
 NOTHING_REPLACED = "nothing was replaced; run it again to start anew"
-"""Text of a stopped command that has not said anything else."""
+DONE = "the work is done, run it again to see the result"
+"""Texts of a stopped command that has not said anything else, and of one that was printing."""
 
 Cell = str | int | float | bool | None
 
@@ -58,8 +59,7 @@ class Output:
 
     With `as_json`, standard output is one JSON document instead of tables. `verbosity` -1 prints
     only problems, and results that go to no file; 1 prints more details. If the command is
-    stopped, `if_stopped` is printed: what was replaced or kept, and how to go on. Once it is
-    `done`, only the printing can be stopped.
+    stopped, `if_stopped` is printed: what was replaced or kept, and how to go on.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
@@ -67,7 +67,6 @@ class Output:
         self.verbosity = verbosity
         self.command = command
         self.if_stopped = NOTHING_REPLACED
-        self.done = False
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
         """Print a result: the document as JSON, otherwise by `show`.
@@ -75,7 +74,7 @@ class Output:
         The document is a mapping or a dataclass. Its entries follow the command, the version and
         ``ok``, which says whether the result is `complete`. If not, exit with `EXIT_INCOMPLETE`.
         """
-        self.done = True
+        self.if_stopped = DONE
         if self.as_json:
             self._say_document(complete, vars(document) if is_dataclass(document) else document)
         else:
@@ -170,24 +169,23 @@ class Output:
 
             yield update
 
+    @contextmanager
+    def new_file(self, file: Path) -> Iterator[Path]:
+        """Yield a temporary path that then replaces `file`; StoreError if it is not writable."""
+        from slatprep.storage.atomic import staged, writing
 
-@contextmanager
-def new_file(file: Path) -> Iterator[Path]:
-    """Yield a temporary path that then replaces `file`; raise StoreError if it is not writable."""
-    from slatprep.storage.atomic import staged, writing
-
-    with writing(str(file), file.parent), staged(file) as path:
-        yield path
-    context = click.get_current_context(silent=True)
-    if context is not None and isinstance(context.obj, Output):
-        context.obj.if_stopped = f"{file} is new; run it again to make all"
+        with writing(str(file), file.parent), staged(file) as path:
+            yield path
+        self.if_stopped = f"{file} is new; run it again to make all"
 
 
-def write_csv(file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def write_csv(
+    output: Output, file: Path, header: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
     """Write a table as CSV whose texts cannot become formulas in a spreadsheet."""
     import csv
 
-    with new_file(file) as path, path.open("w", encoding="utf-8", newline="") as opened:
+    with output.new_file(file) as path, path.open("w", encoding="utf-8", newline="") as opened:
         csv.writer(opened).writerows([header, *(map(_for_spreadsheet, row) for row in rows)])
 
 

@@ -228,6 +228,7 @@ def simulate(
 
     if picture is not None:
         require_picture(picture)
+    work.old_frames(Path(out))  # Not only once all is computed.
     scene: Scene = work.prepare(
         source.field(output, "grid" if source.asset is not None else "slat"),
         work.cells_of(source.store, source.asset),

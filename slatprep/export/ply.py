@@ -124,6 +124,13 @@ def write_points(
     write_ply(path, vertices, frame, units, *labels)
 
 
+def has_comment(path: Path, *comments: str) -> bool:
+    """Return whether the header of a file has one of slatprep's comments on a PLY."""
+    with path.open("rb") as stream:
+        head = stream.read(1024)
+    return any(one.encode() in head for one in comments)
+
+
 def read_bounds(store: Store, ids: Sequence[str]) -> tuple[dict[str, Bounds], tuple[str, ...]]:
     """Return the world bounds of assets by id, from their records, and remarks for the user.
 

@@ -46,6 +46,19 @@ _PITCH = 1.25
 """Distance between neighbours in the scene, in sizes of the unit cube."""
 
 
+@contextmanager
+def _disk_errors() -> Iterator[None]:
+    """Turn an error of USD into an OSError, as the disk did not take a file."""
+    (tf,) = _pxr("Tf")
+    try:
+        yield
+    except tf.ErrorException as error:
+        # It has a line for each block, all with the same reason.
+        reason = next(iter(re.findall(r" : '(?:.*writing file: )?([^'\n]+)", str(error))), "")
+        full = (n for n in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(n) in reason)
+        raise OSError(next(full, errno.EIO), reason or "USD did not say why") from None
+
+
 def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> formats.Writer:
     """Return the writer of a USD file for each asset; see `slatprep.export.FORMATS`.
 
@@ -90,6 +103,7 @@ def write(
     return formats.Exported(asset, name, len(there.material), figures)
 
 
+@_disk_errors()
 def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]]) -> list[str]:
     """Write the scene: gravity, ground, and a reference to each asset; return its name."""
     geom, tf = _pxr("UsdGeom", "Tf")
@@ -106,11 +120,11 @@ def write_scene(size: float, directory: Path, entries: Sequence[dict[str, Any]])
         # A second operation: that of the asset's file lifts it onto the ground.
         place = one.AddTranslateOp(opSuffix="place")
         place.Set(tuple(float(_PITCH * size * step) for step in (column, row, 0)))
-    with _disk_errors():
-        stage.GetRootLayer().Save()
+    stage.GetRootLayer().Save()
     return [SCENE]
 
 
+@_disk_errors()
 def _write_asset(
     path: Path,
     asset_id: str,
@@ -151,8 +165,7 @@ def _write_asset(
         for number, material in enumerate(binned.material):
             _add_material(stage, binding, number, int(material), solid, binned)
         binding.SetMaterialBindSubsetsFamilyType(geom.Tokens.nonOverlapping)
-    with _disk_errors():
-        stage.GetRootLayer().Save()
+    stage.GetRootLayer().Save()
 
 
 def _add_material(
@@ -206,24 +219,10 @@ def _simulation(stage: Any, parent: str, width: float) -> None:
     physics.CollisionAPI.Apply(ground.GetPrim())
 
 
-@contextmanager
-def _disk_errors() -> Iterator[None]:
-    """Turn an error of USD into an OSError, as the disk did not take a file."""
-    (tf,) = _pxr("Tf")
-    try:
-        yield
-    except tf.ErrorException as error:
-        # It has a line for each block, all with the same reason.
-        reason = next(iter(re.findall(r" : '(?:.*writing file: )?([^'\n]+)", str(error))), "")
-        full = (n for n in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(n) in reason)
-        raise OSError(next(full, errno.EIO), reason or "USD did not say why") from None
-
-
 def _stage(path: Path, name: str) -> tuple[Any, Any]:
     """Return a new stage in metres and kilograms, z up, and its root of that name."""
     usd, geom, physics = _pxr("Usd", "UsdGeom", "UsdPhysics")
-    with _disk_errors():
-        stage = usd.Stage.CreateNew(str(path))
+    stage = usd.Stage.CreateNew(str(path))
     geom.SetStageMetersPerUnit(stage, 1.0)
     physics.SetStageKilogramsPerUnit(stage, 1.0)
     geom.SetStageUpAxis(stage, geom.Tokens.z)

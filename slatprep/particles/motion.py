@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
+from slatprep.export.ply import has_comment
 from slatprep.geometry.voxels import filled, occupancy_of, shown_in_cells
 from slatprep.particles import gaussians as splats
 from slatprep.particles.fields import VoxelField
@@ -18,9 +19,6 @@ from slatprep.particles.transfer import doubt_axes, recognise_axes, transfer
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, Place
 from slatprep.storage.atomic import staged
 from slatprep.store import open_store
-
-_HEADER = 4_096
-"""Bytes of a frame that hold its comments."""
 
 CLASSES = MATERIAL_CLASSES[:BACKGROUND]
 
@@ -136,6 +134,17 @@ def run(
     return (moved.positions - shift) / size, moved.gradients
 
 
+def old_frames(out: Path) -> list[Path]:
+    """Return the frames of an earlier run; ConfigError if another file has such a name."""
+    named = [one for one in out.glob("frame-*.ply") if one.stem.removeprefix("frame-").isdigit()]
+    for one in named:
+        if not has_comment(one, *FRAMES.values()):
+            raise ConfigError(
+                f"{one} is no frame of slatprep; move it away, or choose another --out"
+            )
+    return named
+
+
 def write_frames(
     out: Path,
     scene: Scene,
@@ -147,21 +156,10 @@ def write_frames(
 ) -> int:
     """Write ``frame-0000.ply`` and so on, and the picture; return the number of frames.
 
-    Frames that an earlier run left in `out` are removed. ConfigError if another file has such a
-    name.
+    The `old_frames` in `out` are removed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    frames_before = [
-        old for old in out.glob("frame-*.ply") if old.stem.removeprefix("frame-").isdigit()
-    ]
-    for old in frames_before:  # An earlier run may have more frames.
-        with old.open("rb") as file:
-            head = file.read(_HEADER)
-            if not any(line.encode() in head for line in FRAMES.values()):
-                raise ConfigError(
-                    f"{old} is no frame of slatprep; move it away, or choose another --out"
-                )
-    for old in frames_before:
+    for old in old_frames(out):  # There may be more than this run has.
         old.unlink()
     carrier = splats.bind(scene.places, scene.positions, scene.spacing)
     low = moved[0].min(axis=(0, 1)) - scene.spacing

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.errors import ConfigError, require_one_of
 from slatprep.export import target
-from slatprep.export.ply import UNITS, VERTEX, write_points
+from slatprep.export.ply import UNITS, VERTEX, has_comment, write_points
 from slatprep.geometry.voxels import filled, occupancy_of
 from slatprep.particles.fields import VoxelField
 from slatprep.particles.read import FRAMES, Axes, Particles
@@ -196,7 +196,7 @@ def write_transferred(
         names = [name for name in held.dtype.names or () if name not in (VERTEX.names or ())]
         kept = (name for name in names if held.dtype[name].kind in "fiu")
         more = {(name, ""): held[name][result.rows] for name in kept}
-    with target.file(path, _is_material_ply) as new:
+    with target.file(path, lambda there: has_comment(there, UNITS)) as new:
         write_points(
             new,
             positions[result.rows],
@@ -206,8 +206,3 @@ def write_transferred(
             frame,
             more,
         )
-
-
-def _is_material_ply(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return UNITS.encode() in stream.read(1024)

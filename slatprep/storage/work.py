@@ -59,22 +59,22 @@ def scratch_beside(
                 _restore(directory, target)
                 _remove_scratch(directory)
                 clear()
-                if not _is_needed(directory):
-                    # The lock goes last: a folder without a lock does not count as ours.
-                    (directory / LOCK).unlink(missing_ok=True)
-                    with suppress(OSError):  # It may hold somebody's files, or the next lock.
-                        directory.rmdir()
+                _leave(directory)
             finally:
                 os.close(lock)
 
 
-def _is_needed(directory: Path) -> bool:
-    """Return whether an interrupted build left assets or marks; an empty spool is removed."""
+def _leave(directory: Path) -> None:
+    """Remove an empty spool, and the folder, unless an interrupted build left assets or marks."""
     spool = directory / SPOOL
     if any(spool.glob("*/*.arrays")):
-        return True
+        return
     shutil.rmtree(spool, ignore_errors=True)
-    return any(directory.glob(f"{BUILDER}-*"))
+    if not any(directory.glob(f"{BUILDER}-*")):
+        # The lock goes last, because a folder without a lock does not count as ours.
+        (directory / LOCK).unlink(missing_ok=True)
+    with suppress(OSError):  # It may hold somebody's files, or the next process's lock.
+        directory.rmdir()
 
 
 def work_directory(target: Place) -> Path:
