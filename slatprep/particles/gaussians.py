@@ -13,6 +13,7 @@ from slatprep.errors import ConfigError, InputError
 from slatprep.particles.read import SAVED_AXES, Axes
 from slatprep.records import COLOURS
 from slatprep.storage.arrays import write_ply
+from slatprep.storage.atomic import staged
 
 _NEAREST = 8
 """Number of particles that carry a Gaussian; a cell of a cubic lattice has eight corners."""
@@ -200,12 +201,15 @@ def write_picture(path: Path, frames: Sequence[NDArray[np.uint8]], rate: int) ->
     """Write frames (H, W, 3) as an animation (gif, webp) or, as png, five of them in a strip."""
     from PIL import Image
 
-    if path.suffix.lower() == ".png":
-        some = np.linspace(0, len(frames) - 1, min(5, len(frames))).round().astype(int)
-        strip = np.concatenate([frames[number] for number in some], axis=1)
-        Image.fromarray(strip).quantize(64).save(path, optimize=True)
-        return
-    pictures = [Image.fromarray(frame).quantize(64) for frame in frames]
-    pictures[0].save(
-        path, save_all=True, append_images=pictures[1:], duration=round(1000 / rate), loop=0
-    )
+    form = path.suffix[1:]
+    with staged(path) as new:
+        if form.lower() == "png":
+            some = np.linspace(0, len(frames) - 1, min(5, len(frames))).round().astype(int)
+            strip = np.concatenate([frames[number] for number in some], axis=1)
+            Image.fromarray(strip).quantize(64).save(new, form, optimize=True)
+            return
+        shown = round(1000 / rate)
+        pictures = [Image.fromarray(frame).quantize(64) for frame in frames]
+        pictures[0].save(
+            new, form, save_all=True, append_images=pictures[1:], duration=shown, loop=0
+        )

@@ -92,10 +92,12 @@ def read_particles(path: Path, axes: Axes | None = None) -> Particles:
     if len(columns[0]) == 0:
         raise InputError(path, "holds no particles", "at least one")
     # Check column by column, so that a large file is not copied before it is refused.
-    faults = [int(np.argmin(fine)) for fine in map(np.isfinite, columns) if not fine.all()]
+    most = np.finfo(np.float32).max
+    usable = ((column >= -most) & (column <= most) for column in columns)
+    faults = [int(np.argmin(fine)) for fine in usable if not fine.all()]
     if faults:
         where = [float(column[min(faults)]) for column in columns]
-        raise InputError(path, f"particle {min(faults)} lies at {where}", "finite x, y, z")
+        raise InputError(path, f"particle {min(faults)} lies at {where}", "finite float32 x, y, z")
     if axes is None and ply.COMMENTS["pixieverse"] in comments:
         raise InputError(
             path,

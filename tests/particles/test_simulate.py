@@ -279,9 +279,17 @@ def test_the_nearest_gaussian_is_drawn_in_its_colour(tmp_path):
     front = tuple((gaussians.colours_of(rows)[0] * 255).astype(np.uint8))
     assert front in seen and len(seen) == 3  # paper, the front one, the shaded one behind
     for suffix in ("png", "gif"):
-        gaussians.write_picture(tmp_path / f"a.{suffix}", [picture, picture[::-1].copy()], 20)
-    with Image.open(tmp_path / "a.gif") as animation:
+        gaussians.write_picture(tmp_path / f"new/a.{suffix}", [picture, picture[::-1].copy()], 20)
+    with Image.open(tmp_path / "new/a.gif") as animation:
         assert animation.n_frames == 2
+
+
+def test_a_picture_that_fails_leaves_the_older_one(tmp_path):
+    (tmp_path / "a.gif").write_text("older")
+    with pytest.raises(OverflowError):  # GIF has 16 bits for a height.
+        gaussians.write_picture(tmp_path / "a.gif", [np.zeros((70_000, 1, 3), np.uint8)], 20)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
+    assert (tmp_path / "a.gif").read_text() == "older"
 
 
 def write_prediction(path: Path) -> np.ndarray:

@@ -95,6 +95,11 @@ def test_a_large_file_is_refused_without_a_copy(tmp_path):
     refused(file, r"particle 1999999 lies at \[0.0, nan, 0.0\]", 1.5 * rows.nbytes)
 
 
+def test_a_position_that_no_float32_holds_is_refused(tmp_path):
+    np.save(tmp_path / "far.npy", np.array([[0.0, 0.1, 0.2], [0.0, -1e39, 0.2]]))
+    refused(tmp_path / "far.npy", r"particle 1 lies at \[0.0, -1e\+39, 0.2\]", 1e6)
+
+
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian"])
 def test_elements_before_the_vertices_are_stepped_over(form, tmp_path):
     order = "<" if form == "binary_little_endian" else ">"

@@ -89,8 +89,9 @@ def manifest_findings(
     With a sample of rows, files of lines without any of these rows are not read.
     """
     names = file_names(len(store))
+    shards: Sequence[int] = range(len(names))
     if rows is not None:
-        names = sorted({names[row // RECORDS_IN_SHARD] for row in rows})
+        shards = sorted({row // RECORDS_IN_SHARD for row in rows})
     file, manifest = str(folder / BUILD), store.attributes.get("manifest")
     try:
         text = build_text(folder)
@@ -113,8 +114,8 @@ def manifest_findings(
             claims = []  # A column is damaged; a finding on its file reports it.
         for name, said, held in claims:
             yield Finding(file, "", f"{name} is {said!r}", f"{held!r}, as the store has")
-    for name in names:
-        yield from _line_findings(store, folder / name, file_names(len(store)).index(name))
+    for shard in shards:
+        yield from _line_findings(store, folder / names[shard], shard)
 
 
 def _claims(build: BuildRecord, store: Store) -> Iterator[tuple[str, object, object]]:
