@@ -105,6 +105,8 @@ def resolved_contents(
     rows: Sequence[Row], stores: Sequence[SourceStore], declared: Contents, standardised: str
 ) -> Contents:
     """Return the contents of a store, with the latent space that `resolve_latents` finds."""
+    # Sums of the same numbers in another order differ in their last digits.
+    rows = sorted(rows, key=lambda row: row.asset_id)
     moments = list(zip((row.n_voxels for row in rows), moments_of(rows, stores), strict=True))
     return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
 

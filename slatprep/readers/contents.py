@@ -124,8 +124,8 @@ def resolve_latents(
 ) -> LatentSpace:
     """Return the space of a dataset's latents after all assets have been read.
 
-    `moments` holds the voxel count and moments of each asset, in an order that does not depend on
-    the number of jobs. If `standardised` is ``auto``, they decide whether latents are standardised.
+    `moments` holds the voxel count and moments of each asset, in the order of their ids. If
+    `standardised` is ``auto``, they decide whether latents are standardised.
     """
     known = [(count, one) for count, one in moments if one is not None and count]
     if not known:

@@ -164,6 +164,20 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
     np.testing.assert_allclose(joined.mean, both.mean(axis=0), rtol=1e-5)
 
 
+def test_measured_moments_do_not_depend_on_the_order_of_rows(tmp_path):
+    description, whole = tmp_path / "mine.json", "abcdefg"
+    description.write_text(json.dumps({"encoder": "mine", "channels": 8, "resolution": 64}))
+    for name in (whole, "eg", "abcdf"):
+        dataset = Dataset(tmp_path / name)
+        for one in name:
+            dataset.add(one, whole.index(one))
+        parameters = dataset.parameters("pixie", slat={"encoder": str(description)})
+        build_store(parameters, tmp_path / f"{name}.zarr")
+    for name, parts in (("one", ("eg", "abcdf")), ("other", ("abcdf", "eg"))):
+        concat_stores([tmp_path / f"{part}.zarr" for part in parts], tmp_path / f"{name}.zarr")
+        assert tree(tmp_path / f"{name}.zarr") == tree(tmp_path / f"{whole}.zarr")
+
+
 def test_attributes_that_do_not_fit_the_arrays_are_refused(copy):
     edit_attributes(copy, latents={"encoder": "x", "channels": 9, "resolution": 64})
     with pytest.raises(StoreError, match="9 columns of voxel/feats"):
