@@ -226,16 +226,22 @@ def _places_of_sources(store: SourceStore) -> dict[str, Any]:
     return {}
 
 
+def _shared(documents: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the entries of a document that all have."""
+    first, *others = documents
+    return {k: value for k, value in first.items() if all(one.get(k) == value for one in others)}
+
+
 def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildParameters:
-    """Return the parameters for the build's record, with the places of all sources."""
-    places: dict[str, Any] = {"pixieverse": {"root": NO_ROOT}, "slat": {"root": NO_ROOT}}
-    named = [_places_of_sources(source) for source in sources]
-    if all(own == named[0] for own in named):
-        places |= named[0]
-    else:
-        for side in ("pixieverse", "slat"):
-            roots = (own.get(side, {}).get("root", NO_ROOT) for own in named)
-            places[side] = {"root": APART.join(dict.fromkeys(roots))}
+    """Return the parameters for the build's record: all roots, and what all sources share."""
+    encoder = sources[0].contents.latents.encoder
+    unknown = {"pixieverse": {"root": NO_ROOT}, "slat": {"root": NO_ROOT, "encoder": encoder}}
+    named = [unknown | _places_of_sources(source) for source in sources]
+    places = _shared(named)
+    for side, known in unknown.items():
+        each = [own[side] for own in named]
+        roots = dict.fromkeys(own["root"] for own in each)
+        places[side] = {**known, **_shared(each), "root": APART.join(roots)}
     document = {"name": build["name"], **places, **build["parameters"]}
     try:
         return read_as(BuildParameters, orjson.dumps(document))

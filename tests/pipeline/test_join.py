@@ -14,6 +14,8 @@ from support.trees import copied, records_of, tree
 
 from slatprep import ConfigError, StoreError, build_store, concat_stores, open_store, subset_store
 from slatprep.inspect.verify import verify_store
+from slatprep.records import Units
+from slatprep.store.records import build_in
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +213,23 @@ def test_records_beside_a_store_are_taken_only_if_they_are_of_its_build(folder, 
     summary = subset_store(store, tmp_path / "a.zarr", ["a"])
     told = json.loads((summary.records.parent / "build.json").read_text())
     assert told["parameters"]["pixieverse"]["root"] == "unknown"
+
+
+def test_a_joined_store_says_of_its_sources_what_is_true_of_all(tmp_path):
+    for name, samples in (("a", "one"), ("b", "first")):
+        dataset = Dataset(tmp_path / name).having(name)
+        units = {"youngs_modulus": "kPa"}
+        how = {"samples": samples, "units": units, "plausibility": "off"}
+        parameters = dataset.parameters("pixie", pixieverse=how, slat={"encoder": "sam3d"})
+        build_store(parameters, tmp_path / f"{name}.zarr")
+    stores = tmp_path / "a.zarr", tmp_path / "b.zarr"
+    joined = build_in(concat_stores(stores, tmp_path / "ab.zarr").records.parent).parameters
+    assert joined.pixieverse.units == Units(youngs_modulus="kPa")
+    assert (joined.pixieverse.samples, joined.slat.encoder) == ("one", "sam3d")
+    assert str(joined.slat.root) == f"{tmp_path / 'a/slat'} | {tmp_path / 'b/slat'}"
+    shutil.rmtree(tmp_path / "a.manifests")
+    alone = build_in(subset_store(stores[0], tmp_path / "s.zarr", ["a"]).records.parent).parameters
+    assert (str(alone.slat.root), alone.slat.encoder) == ("unknown", "sam3d")
 
 
 def test_a_store_whose_attributes_do_not_say_how_it_was_built_is_refused(copy, tmp_path):
