@@ -104,6 +104,13 @@ class InputError(SlatprepError):
         self.fault = in_unicode(fault)
         self.expected = expected
 
+    def below(self, root: object) -> str:
+        """Return the message on one line as records have it, with paths relative to a root.
+
+        A dataset may move, while its records stay.
+        """
+        return " ".join(str(self).replace(f"{in_unicode(str(root))}/", "").split())
+
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         # Pickle needs this to send an exception with its own signature from a worker
         # process to the parent.

@@ -99,8 +99,11 @@ def process_several(
     good = [first, *(one for one in good if one is not first)]
     parts = [in_table(one.annotation, one.field, contents) for one in good]
     annotation = merge(parts, contents.properties)
-    whys = {sample: " ".join(str(fault).split()) for sample, fault in faults.items()}
-    told = {sample: Contribution(sample, (), why) for sample, why in whys.items()}
+    told = {
+        one.sample: Contribution(one.sample, (), faults[one.sample].below(one.roots.pixieverse))
+        for one in pair.annotations
+        if one.sample in faults
+    }
     told |= {one.pair.sample: _contribution(one, one in good, sources) for one in annotated}
     contributions = tuple(told[one.sample] for one in pair.annotations)
     return replace(

@@ -319,17 +319,17 @@ def _read_bounds(
         sources.append(source)
         arrays, faults = files.npz_small_arrays(data, path, BOUND)
     except InputError as error:
-        warnings.append(f"bounds not read: {error}")
+        warnings.append(f"bounds not read: {error.below(root)}")
         return None
-    warnings += [f"bounds: {fault}" for fault in faults]
+    warnings += [f"bounds: {fault.below(root)}" for fault in faults]
     bounds: dict[str, object] = {}
     for name, value in arrays.items():
         # JSON knows no number longer than a double, and no text beyond Unicode.
         plain = value.astype(np.float64) if value.dtype.kind == "f" else value
         if plain.dtype.kind == "f" and not np.isfinite(plain).all():
-            warnings.append(f"bounds: {path} [{name}] is not finite; left out")
+            warnings.append(f"bounds: {source.path} [{name}] is not finite; left out")
         elif plain.dtype.kind == "U" and not files.is_text(plain):
-            warnings.append(f"bounds: {path} [{name}] is no text; left out")
+            warnings.append(f"bounds: {source.path} [{name}] is no text; left out")
         else:
             bounds[name] = plain.tolist()
     return bounds

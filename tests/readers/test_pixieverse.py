@@ -176,10 +176,17 @@ def test_unreadable_bounds_are_a_warning(make_pair):
     assert field.bounds == {"scale": 2.0}
     (warning,) = field.warnings
     assert "pickle" in warning
-    pair.bounds.write_bytes(b"not a zip")
-    field = read_field(pair)
-    assert field.bounds is None
-    assert "bounds not read" in field.warnings[0]
+    assert warning.startswith("bounds: a/bounds.npz")
+    for content in (b"not a zip", b""):
+        pair.bounds.write_bytes(content)
+        field = read_field(pair)
+        assert field.bounds is None
+        assert field.warnings[0].startswith("bounds not read: a/bounds.npz: ")
+
+
+def test_bounds_that_are_no_numbers_are_named_below_the_root(make_pair):
+    (warning,) = read_field(make_pair(bounds={"min_bounds": np.nan})).warnings
+    assert warning == "bounds: a/bounds.npz [min_bounds] is not finite; left out"
 
 
 CLASS = (9, 8, 7, 3)
