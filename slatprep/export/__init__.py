@@ -16,7 +16,7 @@ from typing import Any
 from slatprep.errors import require_one_of
 from slatprep.export import target
 from slatprep.export.formats import Exported, ExportOptions, Writer, choose_ids, describe_columns
-from slatprep.records import USABLE, Place
+from slatprep.records import USABLE, Place, words_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_outside
 from slatprep.workers import Progress
@@ -107,6 +107,7 @@ def export_store(
     require_one_of("format", format, FORMATS)
     options, opened, out = options or ExportOptions(), open_store(store), Path(out)
     require_outside(out)
+    assets = words_of(assets)
     if verdicts is None:
         verdicts = () if assets else USABLE
     ids = choose_ids(opened, assets, verdicts)

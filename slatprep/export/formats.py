@@ -52,12 +52,12 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
 
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
-    wanted = store.having(verdicts)
+    verdicts, wanted = words_of(verdicts), store.having(verdicts)
     rows = sorted({store.match(name) for name in words_of(assets)}) or range(len(store))
     chosen = sorted(store.ids[row] for row in rows if wanted[row])
     if not chosen:
         raise ConfigError(
-            f"{store.path}: no asset has the verdict {' or '.join(words_of(verdicts))}; those "
+            f"{store.path}: no asset has the verdict {' or '.join(verdicts)}; those "
             f"asked for are {tally(store.column('verdict')[list(rows)])}"
         )
     return chosen

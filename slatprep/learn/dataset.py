@@ -97,7 +97,7 @@ class SparseBatch:
 
     def to(self, device: torch.device | str) -> SparseBatch:
         """Return the batch on a device."""
-        return self._each(lambda tensor: tensor.to(device, non_blocking=True))
+        return self._each(lambda tensor: tensor.to(device=device, non_blocking=True))
 
     def pin_memory(self) -> SparseBatch:
         """Return the batch in pinned memory; `DataLoader` calls this."""
@@ -137,7 +137,8 @@ class SlatDataset(Dataset[Item]):
     Raises
     ------
     ConfigError
-        If no asset is left, or the split, a verdict or `augmentation` is unknown.
+        If no asset is left, or the split, a verdict or `augmentation` is unknown, or
+        `min_confidence` or `seed` is out of its range.
     StoreError
         If the store cannot be read.
     """
@@ -155,6 +156,10 @@ class SlatDataset(Dataset[Item]):
         augmentation: Augmentation = "none",
         seed: int = 0,
     ) -> None:
+        if min_confidence is not None and not 0 <= min_confidence <= 1:
+            raise ConfigError(f"min_confidence is {min_confidence}; expected 0 to 1")
+        if seed < 0:
+            raise ConfigError(f"seed is {seed}; expected 0 or more")
         self.store = open_store(store, copy=True)
         self.split = split
         if split is not None and splits is None:
@@ -229,7 +234,7 @@ def collate(items: Sequence[Item]) -> SparseBatch:
 class EpochSampler(Sampler[Draw]):
     """Each of `length` assets once, in an order that follows from seed and epoch.
 
-    Without `shuffle` the order is that of the store.
+    Each pass ends an epoch. Without `shuffle` the order is that of the store.
     """
 
     def __init__(self, length: int, *, shuffle: bool, seed: int) -> None:
@@ -240,10 +245,12 @@ class EpochSampler(Sampler[Draw]):
         return self.length
 
     def __iter__(self) -> Iterator[Draw]:
+        epoch, first = self.epoch, self.first
+        self.epoch, self.first = epoch + 1, 0
         order = np.arange(self.length)
         if self.shuffle:
-            order = np.random.default_rng([self.seed, self.epoch]).permutation(self.length)
-        return (Draw(int(index), self.epoch) for index in order[self.first :])
+            order = np.random.default_rng([self.seed, epoch]).permutation(self.length)
+        return (Draw(int(index), epoch) for index in order[first:])
 
 
 class SlatLoader(DataLoader[SparseBatch]):
@@ -297,5 +304,8 @@ class SlatLoader(DataLoader[SparseBatch]):
         )
 
     def set_epoch(self, epoch: int, batches: int = 0) -> None:
-        """Set the epoch, which decides order and augmentation; skip its first `batches`."""
+        """Set the epoch of the next pass, which decides order and augmentation.
+
+        The pass skips its first `batches`. Without a call, each pass is the next epoch.
+        """
         self.order.epoch, self.order.first = epoch, batches * (self.batch_size or 1)

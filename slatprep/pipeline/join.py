@@ -57,7 +57,8 @@ def subset_store(
 ) -> BuildSummary:
     """Make a store of some assets of another store.
 
-    Its bytes are those of a build of the same assets with the same given ranges.
+    Its bytes are those of a build of these assets, if that build has the same ranges and moments
+    of latents.
 
     Parameters
     ----------

@@ -102,12 +102,12 @@ COLOURS = np.zeros((256, 3), dtype=np.uint8)
 for _material, _colour in MATERIAL_COLOURS.items():
     COLOURS[_material] = tuple(bytes.fromhex(_colour[1:]))
 
-_Words = TypeVar("_Words", bound=Iterable[object])
+_Word = TypeVar("_Word")
 
 
-def words_of(given: _Words) -> _Words | tuple[str]:
-    """Return words as they are, and a single word that is given as a text as a tuple."""
-    return (given,) if isinstance(given, str) else given
+def words_of(given: str | Iterable[_Word]) -> tuple[str | _Word, ...]:
+    """Return words as a tuple; a text is a single word."""
+    return (given,) if isinstance(given, str) else tuple(given)
 
 
 class Engine(StrEnum):

@@ -29,7 +29,11 @@ def read_bounded(place: Place, limit: int) -> bytes:
 
     Raises OSError if it is unreadable or not a regular file, ValueError above `limit` bytes.
     """
-    data = storage_of(place).read(limit)
+    return bounded(storage_of(place).read(limit), limit)
+
+
+def bounded(data: bytes, limit: int) -> bytes:
+    """Return the data of a file, read up to a limit; ValueError if it has more bytes."""
     if len(data) > limit:
         raise ValueError(f"larger than {limit / 2**20:g} MiB")
     return data

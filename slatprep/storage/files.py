@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _AT = os.open in os.supports_dir_fd
 _NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a writer
+_FOLDER = getattr(os, "O_DIRECTORY", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
 OWN_FILE = os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | _NO_LINK | _NO_WAITING
@@ -61,13 +62,19 @@ class LocalFolder:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
-        self._descriptor = os.open(self.path, os.O_RDONLY) if _AT else None
+        self._descriptor = os.open(self.path, os.O_RDONLY | _FOLDER) if _AT else None
 
     def open(self, name: str) -> LocalFile:
         """Open a file for reading, without buffer."""
         if self._descriptor is None:
             return LocalFile(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
         return LocalFile(name, opener=self._open_at)
+
+    def read(self, name: str, limit: int) -> bytes:
+        """Read at most `limit` + 1 bytes of a file; the last byte shows that it is too large."""
+        with self.open(name) as file:
+            # read() would allocate all that it is allowed to return.
+            return file.pread(min(file.size(), limit + 1), 0)
 
     def _open_at(self, name: str, flags: int) -> int:
         return os.open(name, flags | _NO_WAITING, dir_fd=self._descriptor)

@@ -210,6 +210,10 @@ class RemoteFolder:
         """Open a file for reading, without a request yet."""
         return RemoteFile(self._place / name)
 
+    def read(self, name: str, limit: int) -> bytes:
+        """Read at most `limit` + 1 bytes of a file; the last byte shows that it is too large."""
+        return self.open(name).pread(limit + 1, 0)
+
 
 def stamp_of(entry: Mapping[str, Any]) -> str:
     """Return the size, tags and time in fsspec's entry of an object, which tell its content."""

@@ -13,14 +13,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, StoreError, UnknownAssetError, amount, require_one_of
 from slatprep.records import Contents, Normalization, Place, Verdict, words_of
-from slatprep.storage.place import storage_of
+from slatprep.storage.place import Folder, storage_of
 from slatprep.storage.remote import connected
 from slatprep.storage.versions import store_name
 from slatprep.store import contract
@@ -46,6 +46,19 @@ class AttributesError(StoreError):
     """A store whose attributes lack what readers rely on."""
 
 
+class _Ids(list[str]):
+    """The ids of a store's rows; changed ids would name other rows."""
+
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
+        raise TypeError("the ids of a store cannot be changed; change a copy, [*store.ids]")
+
+    __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse
+    append = clear = extend = insert = pop = remove = reverse = sort = _refuse
+
+    def __reduce__(self) -> tuple[type, tuple[list[str]]]:
+        return list, ([*self],)
+
+
 class AssetTable:
     """The assets of a store as a table; `slatprep.store.Store` adds their voxels.
 
@@ -53,9 +66,9 @@ class AssetTable:
     arrays' metadata that the root repeats, or that have been read since.
     """
 
-    def __init__(self, path: Place, document: dict[str, Any]) -> None:
+    def __init__(self, path: Place, document: dict[str, Any], folder: Folder | None = None) -> None:
         self.path, self.document = path, document
-        self._folder = storage_of(path).folder()
+        self._folder = folder or storage_of(path).folder()
         gathered = document.get("consolidated_metadata")
         metadata = gathered.get("metadata") if isinstance(gathered, dict) else None
         self.metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, dict) else {}
@@ -159,8 +172,11 @@ class AssetTable:
 
     @cached_property
     def ids(self) -> list[str]:
-        """Asset ids; they ascend, except where an update added rows at the end."""
-        return [str(asset_id) for asset_id in self.column("id")]
+        """Asset ids; they ascend, except where an update added rows at the end.
+
+        The list cannot be changed.
+        """
+        return _Ids(map(str, self.column("id")))
 
     @cached_property
     def offsets(self) -> NDArray[np.int64]:
@@ -318,10 +334,13 @@ class AssetTable:
     def group(self) -> zarr.Group:
         """The root as a group of zarr-python, for everything that this class does not offer.
 
+        It opens each file by its path, so it must not be used once the store is replaced.
+
         Raises
         ------
         StoreError
-            If the metadata name anything that `slatprep.store.contract` does not allow.
+            If the metadata name anything that `slatprep.store.contract` does not allow, or another
+            store is there now.
         """
         import zarr
 
@@ -330,11 +349,14 @@ class AssetTable:
         try:
             # Consolidated, so that zarr-python reads only the metadata that were just checked.
             with connected(remote) if remote else nullcontext():
-                return zarr.open_group(
+                group = zarr.open_group(
                     str(self.path), mode="r", zarr_format=3, use_consolidated=True
                 )
         except (*BAD_METADATA, OSError) as error:
             raise StoreError(f"{self.path}: bad metadata ({error!r})") from None
+        if dict(group.attrs) != self.attributes:
+            raise other_store(self.path)
+        return group
 
     def holds(self, name: str) -> bool:
         """Return whether the store has an array, by its full name."""
@@ -406,7 +428,7 @@ def match_id(name: str | int, rows: Mapping[str, int], where: object, listing: s
     UnknownAssetError names `where` the ids are, and has `listing`, a hint at how to list them.
     """
     if not isinstance(name, str):
-        return _numbered(operator.index(name), rows, where)
+        return _numbered(number_of(name), rows, where)
     if name in rows:
         return rows[name]  # A loop over all assets must not search all ids each time.
     alike = [known for known in rows if known.startswith(name)] if name else []
@@ -421,6 +443,24 @@ def match_id(name: str | int, rows: Mapping[str, int], where: object, listing: s
     if not alike and name.isascii() and name.isdigit():
         return _numbered(int(name), rows, where)
     raise _unknown(name, rows, where, listing)
+
+
+def number_of(row: int) -> int:
+    """Return the number of a row as an int; UnknownAssetError for an entry of a mask."""
+    if isinstance(row, bool | np.bool_):
+        raise UnknownAssetError(
+            f"{row} is an entry of a mask, not an asset; expected the rows that the mask chooses: "
+            "numpy.flatnonzero(mask)"
+        )
+    return operator.index(row)
+
+
+def other_store(path: Place) -> StoreError:
+    """Return the error that a store was replaced since it was opened."""
+    return StoreError(
+        f"{path}: is another store than the one that was opened (was the store replaced?); "
+        "open it again"
+    )
 
 
 def _numbered(number: int, rows: Mapping[str, int], where: object) -> int:

@@ -18,9 +18,15 @@ from slatprep.errors import ConfigError, StoreError, amount
 from slatprep.geometry.voxels import shown_in_cells, voxels_at
 from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents, words_of
-from slatprep.storage.documents import read_document
-from slatprep.storage.place import place_of, storage_of
-from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError
+from slatprep.storage.documents import bounded, parse_document
+from slatprep.storage.place import Folder, place_of, storage_of
+from slatprep.store.assets import (
+    ASSET_COLUMNS,
+    AssetTable,
+    AttributesError,
+    number_of,
+    other_store,
+)
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_METADATA_BYTES, MAX_VOXELS
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with
@@ -178,6 +184,8 @@ class Store(AssetTable):
         Place of the store.
     document : dict
         The root's ``zarr.json``.
+    folder : Folder, optional
+        The store's folder, open, if its document was read through it.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -248,6 +256,7 @@ class Store(AssetTable):
         StoreError
             If there is no such asset, or its rows are invalid.
         """
+        index = number_of(index)
         if not -len(self) <= index < len(self):
             raise StoreError(f"{self.path} has no asset {index}; it has {len(self)} assets")
         index %= len(self)
@@ -323,7 +332,7 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
     path = storage_of(place_of(path)).current_version()
     if copy:
         path = storage_of(path).copied_version()
-    document = _root_document(path)
+    document, folder = _opened_root(path)
     attributes = document.get("attributes", {})
     if attributes.get("format") != FORMAT:
         raise StoreError(
@@ -336,7 +345,7 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
             f"{path} has format version {version!r}; this slatprep reads {FORMAT_VERSION}. "
             "Use the slatprep that wrote it, or a newer one"
         )
-    store = Store(path.absolute(), document)  # The working folder may change.
+    store = Store(path.absolute(), document, folder)  # The working folder may change.
     # A store is refused when it is opened, not halfway through a command.
     for finding in width_findings(store.about, store.metadata):
         raise AttributesError(f"{path}/{finding}; run `slatprep verify`")
@@ -350,10 +359,7 @@ def open_again(path: Place, identity: str) -> Store:
     """
     store = open_store(path)
     if store.identity != identity:
-        raise StoreError(
-            f"{path}: is another store than the one that was opened (was the store replaced?); "
-            "open it again"
-        )
+        raise other_store(path)
     return store
 
 
@@ -384,7 +390,7 @@ def opened_elsewhere(opens: Callable[..., Store], *of: object) -> Store:
 def is_store(path: Place) -> bool:
     """Return whether a place itself is a slatprep store of any format version."""
     try:
-        attributes = _root_document(path).get("attributes", {})
+        attributes = _opened_root(path)[0].get("attributes", {})
     except StoreError:
         return False
     return bool(attributes.get("format") == FORMAT)
@@ -419,14 +425,17 @@ def require_beside(folder: Path) -> None:
     require_outside(folder)
 
 
-def _root_document(path: Place) -> dict[str, Any]:
-    """Return the root's ``zarr.json``, or an empty dict if it is not that of a store.
+def _opened_root(path: Place) -> tuple[dict[str, Any], Folder | None]:
+    """Return the root's ``zarr.json``, empty if it is not that of a store, and its folder.
 
+    All files are read through that folder, as a build may put another one at the path at any time.
     StoreError if the file does not exist or cannot be read.
     """
     file = path / "zarr.json"
     try:
-        document = read_document(file, MAX_METADATA_BYTES)
+        folder = storage_of(path).folder()
+        text = bounded(folder.read("zarr.json", MAX_METADATA_BYTES), MAX_METADATA_BYTES)
+        document = parse_document(text)
     except (FileNotFoundError, NotADirectoryError):
         raise StoreError(
             f"{path} is not a slatprep store: {file} does not exist; build a store with "
@@ -440,7 +449,7 @@ def _root_document(path: Place) -> dict[str, Any]:
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.EISDIR):
             raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
-        return {}  # A pipe or a folder of that name is no store.
+        return {}, None  # A pipe or a folder of that name is no store.
     except ValueError:
-        return {}
-    return document if isinstance(document.get("attributes"), dict) else {}
+        return {}, None
+    return document if isinstance(document.get("attributes"), dict) else {}, folder

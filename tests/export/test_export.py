@@ -260,6 +260,8 @@ def test_assets_are_chosen_by_id_and_verdict(store, tmp_path):
         ({"assets": "bear.front"}, ["bear.front"]),  # A text is one asset, or one verdict.
         ({"verdicts": "good"}, open_store(store).ids),
         ({"verdicts": "all"}, open_store(store).ids),  # As on the command line.
+        ({"assets": np.array([3, 0]), "verdicts": np.array(["good", "failed"])}, ["ant", "cup"]),
+        ({"verdicts": (verdict for verdict in ["good"])}, open_store(store).ids),
     ):
         export_store(store, tmp_path / "some", "npz", **arguments)
         assert [entry["asset_id"] for entry in index_of(tmp_path / "some")] == chosen

@@ -162,6 +162,28 @@ def test_a_plain_loader_augments_each_epoch_anew(learn_store):
     assert not all(map(torch.equal, *found))
 
 
+def test_each_pass_of_a_loader_is_the_next_epoch(learn_store):
+    dataset = learn.SlatDataset(learn_store, augmentation="all", seed=3)
+    loader = learn.SlatLoader(dataset, 3, shuffle=True)
+    known = [[batch.coords for batch in epochs(loader, epoch)] for epoch in (0, 1, 5, 6)]
+    loader.set_epoch(0)
+    passes = [[batch.coords for batch in loader] for _ in range(2)]
+    loader.set_epoch(5, 1)  # Only the next pass lacks the first batch.
+    passes += [known[2][:1] + [batch.coords for batch in loader]]
+    passes += [[batch.coords for batch in loader]]
+    for own, expected in zip(passes, known, strict=True):
+        assert all(map(torch.equal, own, expected)) and len(own) == len(loader)
+
+
+@pytest.mark.parametrize(
+    "given", [{"min_confidence": 90}, {"min_confidence": np.nan}, {"seed": -1}]
+)
+def test_numbers_out_of_range_are_refused(learn_store, given):
+    (name,) = given
+    with pytest.raises(ConfigError, match=f"{name} is .*; expected 0"):
+        learn.SlatDataset(learn_store, **given)
+
+
 def test_symmetries_are_the_groups_they_should_be():
     for kind, size in (("none", 1), ("upright", 8), ("all", 48)):
         matrices = lattice_symmetries(kind)

@@ -1,6 +1,7 @@
 """A store's table of assets, and each asset, against the arrays that zarr wrote."""
 
 import pickle
+import random
 import shutil
 import sys
 from pathlib import Path
@@ -117,6 +118,23 @@ def test_what_is_changed_in_an_asset_or_table_changes_nothing_in_the_store(made)
         store.table()["verdict"][:] = "failed"
     with pytest.raises(ValueError, match="read-only"):
         store.offsets[1] = 7
+    with pytest.raises(TypeError, match="change a copy"):
+        random.shuffle(store.ids)
+    for change in (store.ids.sort, store.ids.reverse, store.ids.pop, store.ids.clear):
+        with pytest.raises(TypeError, match="change a copy"):
+            change()
+    assert store.ids == list(IDS) == pickle.loads(pickle.dumps(store.ids))
+
+
+def test_an_entry_of_a_mask_is_no_asset(made):
+    store, _ = made
+    for use in (store.match, store.rows, store.read, store.asset):
+        for entry in (True, np.True_, np.False_):
+            with pytest.raises(StoreError, match=r"numpy\.flatnonzero"):
+                use(entry)
+        with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+            use([0, 1])
+    assert store.rows(np.uint8(3)) == (16, 23)
 
 
 def test_properties_are_found_by_name(made):

@@ -22,11 +22,13 @@ from google_crc32c import value as crc32c
 from support.commands import refused, run
 from support.made_store import edit_attributes, edit_json, placed, rewrite
 from support.memory import less_than
+from support.trees import copied
 
 from slatprep import Store, StoreError, build_store, open_store
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD, StoreParameters
 from slatprep.pipeline.rows import SourceStore
+from slatprep.storage.files import LocalFolder
 from slatprep.store.assets import ASSET_COLUMNS
 from slatprep.store.contract import gate_findings
 from slatprep.store.layout import ARRAYS
@@ -229,6 +231,34 @@ def test_a_replaced_store_is_not_mixed_with_the_new_one(copy):
             read()
 
 
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_a_store_replaced_while_it_is_opened_is_one_of_the_two(copy, monkeypatch, moment):
+    newer, opens = copied(copy, copy.with_name("newer")), LocalFolder.__init__
+    edit_attributes(newer, manifest="0" * 64)
+    rewrite(newer, "asset/category", 0, "newer")
+
+    def open_and_replace(folder: LocalFolder, path: Path) -> None:
+        if moment == "after":
+            opens(folder, path)
+        if newer.exists():
+            copy.rename(copy.with_name("older"))
+            newer.rename(copy)
+        if moment == "before":
+            opens(folder, path)
+
+    monkeypatch.setattr(LocalFolder, "__init__", open_and_replace)
+    opened = open_store(copy)
+    parts = opened.about.manifest == "0" * 64, opened.column("category")[0] == "newer"
+    assert parts == (moment == "before",) * 2
+
+
+def test_zarr_opens_the_store_that_was_opened_or_none(copy):
+    opened = open_store(copy)
+    edit_attributes(copy, manifest="0" * 64)
+    with pytest.raises(StoreError, match=r"was the store replaced\?\); open it again"):
+        opened.group  # noqa: B018
+
+
 def test_a_store_that_was_sent_to_a_process_is_that_store_or_none(copy):
     """Of another build or another order of the same rows, or gone; each use says so."""
     opened = open_store(copy)
@@ -265,9 +295,10 @@ opened = []
 sys.addaudithook(lambda event, args: event == "open" and opened.append(str(args[0])))
 from slatprep.store import open_store
 store = open_store({str(store)!r})
-# The folder itself is opened, too, so that what is read stays of one store.
-files = [name for name in opened if name.startswith({str(store / "x")[:-1]!r})]
-assert files == [{str(store / "zarr.json")!r}], files
+# The folder itself is opened, too, and files below it, so that what is read stays of one store.
+below = {str(store / "x")[:-1]!r}
+files = [name for name in opened if name.startswith(below) or not name.startswith("/")]
+assert files == ["zarr.json", "zarr.json"], files  # Python tells of a file and of its opener.
 assert store.read(2)["feats"].shape[1] == 8
 store.asset("cup").grid_properties, store.column("verdict")
 assert "zarr" not in sys.modules
@@ -276,7 +307,7 @@ assert not {{"fsspec", "s3fs"}} & set(sys.modules)
 del store
 """
     command = [sys.executable, "-X", "dev", "-c", code]
-    told = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = subprocess.run(command, capture_output=True, text=True, check=True, cwd=store.parent)
     assert "ResourceWarning" not in told.stderr
 
 
