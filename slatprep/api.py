@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from slatprep.parameters.files import checked
 from slatprep.records import (
     MAX_LATENT_RESOLUTION,
     RESOLUTION,
+    UNANNOTATED,
     Alignment,
     Annotation,
     MaterialField,
@@ -124,7 +126,8 @@ def annotate_voxels(
     Raises
     ------
     ValueError
-        If `coords` are no voxels, or `transform` is no similarity.
+        If `coords` are no voxels, `transform` is no similarity, or the field's voxels, classes
+        and properties do not fit together.
     ConfigError
         If a parameter makes no sense.
     """
@@ -133,7 +136,27 @@ def annotate_voxels(
     else:
         place_map = PlaceMap(np.asarray(transform, dtype=np.float64))
     places = place_map.places(_voxels(coords, "coords", resolution), resolution)
-    return sample(field, places, checked(SampleParameters, parameters or SampleParameters()))
+    parameters = checked(SampleParameters, parameters or SampleParameters())
+    return sample(_checked(field), places, parameters)
+
+
+def _checked(field: MaterialField) -> MaterialField:
+    """Return a field with the arrays that lookups rely on; ValueError if they do not fit."""
+    voxels = _voxels(field.voxels, "field.voxels")
+    material, properties = np.asarray(field.material), np.asarray(field.properties)
+    for name, values, shape in (
+        ("material", material, (len(voxels),)),
+        ("properties", properties, (len(voxels), len(field.table))),
+    ):
+        if values.shape != shape:
+            raise ValueError(f"field.{name} has shape {values.shape}; expected {shape}")
+    classes = material.astype(np.uint8)
+    if not ((classes == material) & (classes < UNANNOTATED)).all():
+        raise ValueError(
+            f"field.material has values that are no classes; expected 0 to {UNANNOTATED - 1}"
+        )
+    properties = properties.astype(np.float32)
+    return replace(field, voxels=voxels, material=classes, properties=properties)
 
 
 def _voxels(voxels: ArrayLike, name: str, side: int = RESOLUTION) -> NDArray[np.uint8]:

@@ -8,6 +8,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -98,6 +99,43 @@ def test_a_field_is_looked_up_at_slat_voxels():
         here = found.material == stuff[0]
         assert here.any()
         np.testing.assert_allclose(found.properties[here], [stuff[1:]] * here.sum(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "values", "said"), [
+    ("voxels", np.uint8(64), r"field\.voxels has values from .* to 64; expected whole"),
+    ("voxels", -5, "field.voxels has values from -5"),
+    ("voxels", np.nan, "field.voxels has values from nan"),
+    ("material", -1, "classes; expected 0 to 254"),
+    ("material", 255, "classes; expected 0 to 254"),
+    ("material", 0.5, "classes; expected 0 to 254"),
+    ("material", None, r"field\.material has shape \(\d+,\); expected"),
+    ("properties", None, r"field\.properties has shape \(\d+, 3\); expected"),
+])  # fmt: skip
+def test_a_field_whose_arrays_do_not_fit_is_refused_in_words(name, values, said):
+    asset = make_asset(2)
+    field = field_of(asset)
+    array = getattr(field, name)[:-1]
+    if values is not None:
+        array = getattr(field, name).astype(np.result_type(values, np.int16))
+        array[3] = values
+    with pytest.raises(ValueError, match=said):
+        slatprep.annotate_voxels(replace(field, **{name: array}), asset.coords, QUARTER_TURN)
+
+
+@pytest.mark.parametrize("dtype", [">i8", ">f4", np.int8, object])
+def test_arrays_of_a_field_may_have_any_type_of_number_and_may_change(dtype):
+    asset = make_asset(2)
+    field = field_of(asset)
+    expected = slatprep.annotate_voxels(field, asset.coords, QUARTER_TURN)
+    arrays = {name: getattr(field, name) for name in ("voxels", "material")}
+    given = replace(field, **{name: array.astype(dtype) for name, array in arrays.items()})
+    other = given.voxels.copy()
+    given.voxels[:] = 0
+    slatprep.annotate_voxels(given, asset.coords, QUARTER_TURN)
+    given.voxels[:] = other
+    found = slatprep.annotate_voxels(given, asset.coords, QUARTER_TURN)
+    np.testing.assert_array_equal(found.material, expected.material)
+    assert found.material.dtype == np.uint8
 
 
 def test_eight_voxels_of_a_finer_grid_are_placed_and_looked_up_as_the_one_they_fill():

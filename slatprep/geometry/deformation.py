@@ -43,14 +43,14 @@ class PlaceMap:
 
     def to_pixieverse(self, points: ArrayLike) -> NDArray[np.float64]:
         """Map points (N, 3) of the SLAT frame to the PixieVerse frame."""
-        points = np.asarray(points, dtype=np.float64)
+        points = _points(points)
         if self.deformation is not None:
             points = deform(self.deformation, points)
         return apply_transform(invert_transform(self.transform), points)
 
     def to_slat(self, points: ArrayLike) -> NDArray[np.float64]:
         """Map points (N, 3) of the PixieVerse frame to the SLAT frame."""
-        carried = apply_transform(self.transform, points)
+        carried = apply_transform(self.transform, _points(points))
         if self.deformation is None:
             return carried
         return undeform(self.deformation, carried)
@@ -60,7 +60,7 @@ class PlaceMap:
 
         The ratio (N,) is that of a volume in the SLAT frame to the same in the PixieVerse frame.
         """
-        points = np.asarray(points, dtype=np.float64)
+        points = _points(points)
         own = abs(float(np.linalg.det(self.transform[:3, :3])))
         if self.deformation is None:
             return np.full(len(points), own)
@@ -72,6 +72,13 @@ class PlaceMap:
     ) -> NDArray[np.float64]:
         """Return the PixieVerse positions (N, 3) of SLAT voxels in a grid of `resolution`."""
         return self.to_pixieverse(voxel_centres(coords, resolution))
+
+
+def _points(points: ArrayLike) -> NDArray[np.float64]:
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points have shape {array.shape}; expected (N, 3)")
+    return array
 
 
 def map_of(alignment: Alignment) -> PlaceMap:

@@ -248,6 +248,10 @@ def test_a_point_goes_there_and_back():
         x = points(reach=0.6)
         back = way.to_slat(way.to_pixieverse(x))
         assert np.abs(back - x).max() * 64 < 1e-3
+        for wrong in ([0.1, 0.2, 0.3], np.zeros((2, 2, 3)), np.zeros((2, 4))):
+            for method in (way.to_slat, way.to_pixieverse, way.volume_ratios):
+                with pytest.raises(ValueError, match=r"have shape .*; expected \(N, 3\)"):
+                    method(wrong)
 
 
 @settings(max_examples=25)
