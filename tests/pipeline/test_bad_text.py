@@ -57,8 +57,7 @@ def test_a_store_cannot_have_a_name_that_is_not_utf_8(make_dataset, tmp_path):
     with pytest.raises(StoreError, match=r"b\\udcff: .*UTF-8"):
         build_store(dataset.parameters(), tmp_path / BAD)
     assert not (tmp_path / BAD).exists()
-    sources = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
-    assert "UTF-8" in run("build-store", *sources, "--out", tmp_path / BAD, code=2).output
+    assert "UTF-8" in run("build-store", *dataset.sides, "--out", tmp_path / BAD, code=2).output
     assert not [path for path in tmp_path.iterdir() if path != dataset.root]
 
 

@@ -141,8 +141,7 @@ def test_odd_sources_are_told_by_the_build_and_of_its_store(dataset, tmp_path):
         np.save(path, np.roll(mask, 3, axis=0))
     still_channel(dataset, "c")
     out = tmp_path / "s.zarr"
-    words = ("build-store", "--pixieverse", dataset.root / "pixieverse", "--slat",
-             dataset.root / "slat", "--out", out, "--decoys", "0")  # fmt: skip
+    words = ("build-store", *dataset.sides, "--out", out, "--decoys", "0")
     masks = "masks of 2 of 6 assets (b, d) are unusual: of b: clip_features_mask.npy leaves out "
     latents = "latents of 1 of 6 assets (c) are unusual: channel 7 of feats is the same in all rows"
     built = run(*words).stderr

@@ -47,15 +47,15 @@ def test_no_change_writes_nothing_and_one_that_keeps_size_and_times_is_seen(buil
 
 def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     dataset, out = built
-    words = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
-    assert "changed" not in run("build-store", *words, "--out", out, "--decoys", "0").stdout
-    again = run("build-store", *words, "--out", out, "--decoys", "0", "--verbose").stdout
+    words = ("build-store", *dataset.sides, "--out", out, "--decoys", "0")
+    assert "changed" not in run(*words).stdout
+    again = run(*words, "--verbose").stdout
     assert "changed: nothing\n" in again and "removed" not in again
     assert "assets:  3 (0 aligned, 3 taken over, 0 not built, 0 skipped) in" in again
     rows = [line.split()[:2] for line in again.splitlines() if line[:2] in ("a ", "b ", "c ")]
     assert rows == [[name, "good"] for name in "abc"]
     (dataset.root / "slat" / "a.npz").unlink()
-    less = run("build-store", *words, "--out", out, "--decoys", "0", code=1)
+    less = run(*words, code=1)
     assert "removed: 1 asset of the store that was there: a (cannot be" in less.stderr
     assert "changed" not in less.stdout
     other = out.with_name("other.zarr")
@@ -64,14 +64,13 @@ def test_what_leaves_a_store_is_counted_and_so_is_that_nothing_changed(built):
     assert "assets:  1 copied in" in said.stdout and "removed: 1 asset" in said.stderr
     quiet = run("subset", out, "--asset", "b", "--out", other, "--quiet")
     assert (quiet.stdout, quiet.stderr[:16]) == ("", "removed: 1 asset")
-    fresh = document("build-store", *words, "--out", other, "--fresh", code=1)
+    fresh = document("build-store", *dataset.sides, "--out", other, "--fresh", code=1)
     assert (fresh["removed"], fresh["unchanged"]) == (0, False)
 
 
 def test_ranges_that_move_are_told_and_what_follows(built, tmp_path):
     dataset, out = built
-    words = ("build-store", "--pixieverse", dataset.root / "pixieverse")
-    words += ("--slat", dataset.root / "slat", "--out", out, "--decoys", "0")
+    words = ("build-store", *dataset.sides, "--out", out, "--decoys", "0")
     assert "ranges" not in run(*words).stderr
     dataset.add("d", seed=3)
     grid = dataset.assets["d"].grid
@@ -93,8 +92,7 @@ def test_ranges_that_move_are_told_and_what_follows(built, tmp_path):
 
 def test_a_dry_run_counts_what_the_build_removes_and_both_say_why(built):
     dataset, out = built
-    words = ("build-store", "--pixieverse", dataset.root / "pixieverse")
-    words += ("--slat", dataset.root / "slat", "--out", out, "--decoys", "0")
+    words = ("build-store", *dataset.sides, "--out", out, "--decoys", "0")
     (dataset.root / "slat" / "a.npz").unlink()
     for path in dataset.root.rglob("b*"):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -203,27 +201,19 @@ def test_a_dry_run_looks_where_the_build_does(built, tmp_path):
         plan_build(dataset.parameters(), tmp_path / "s")
     own = tmp_path / "records"
     assert plan_build(dataset.parameters(), tmp_path / "s", manifests=own).actions["reuse"] == 3
-    sides = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
-    words = ("build-store", *sides, "--out", tmp_path / "s", "--manifests", own, "--dry-run")
-    assert "3 taken over" in run(*words).output
+    words = ("build-store", *dataset.sides, "--out", tmp_path / "s", "--manifests", own)
+    assert "3 taken over" in run(*words, "--dry-run").output
     assert not own.exists()
 
 
 def test_a_dry_run_writes_nothing(built):
     dataset, out = built
     before = tree(out.parent)
-    sources = ("--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat")
-    words = ("build-store", *sources, "--out", out, "--dry-run")
-    document = json.loads(run(*words, "--json").stdout)
-    assert document["actions"] == {
-        "align": 0,
-        "reuse": 3,
-        "resume": 0,
-        "refuse": 0,
-        "skip": 0,
-        "remove": 0,
-    }
-    assert all(asset["reason"] == "unchanged" for asset in document["assets"])
+    words = ("build-store", *dataset.sides, "--out", out, "--dry-run")
+    plan = document(*words)
+    others = ("align", "resume", "refuse", "skip", "remove")
+    assert plan["actions"] == {"reuse": 3, **dict.fromkeys(others, 0)}
+    assert all(asset["reason"] == "unchanged" for asset in plan["assets"])
     assert "nothing is written" in run(*words).stdout
     assert tree(out.parent) == before
     dataset.add("d", seed=3)

@@ -119,6 +119,11 @@ class Dataset:
         asset = self.assets[object_id]
         self.write_slat(f"{object_id}.npz", asset.coords, asset.feats + np.float32(by))
 
+    @property
+    def sides(self) -> tuple[object, ...]:
+        """Return the options by which a command is told of the sources."""
+        return "--pixieverse", self.root / "pixieverse", "--slat", self.root / "slat"
+
     def parameters(self, ranges: str = "dataset", **groups: dict[str, object]) -> BuildParameters:
         """Return the parameters of a build with many small shards, and with others of groups."""
         usual = BuildParameters(
