@@ -49,16 +49,13 @@ def test_an_end_that_only_rounding_moved_is_not_told():
 
 def test_a_build_that_only_takes_assets_away_tells_of_no_range_again(make_dataset, tmp_path):
     dataset = make_dataset(*"abcf")
-    grid = dataset.assets["f"].grid
-    grid[..., 1] *= 1e6
-    dataset.write_grid("f", grid)
+    dataset.write_grid("f", dataset.assets["f"].grid * [1, 1e6, 1, 1])
     parameters = dataset.parameters(pixieverse={"plausibility": "off"})
     first = build_store(parameters, tmp_path / "s.zarr").warnings
     assert any("f alone makes the range of youngs_modulus" in text for text in first)
     dataset.remove("a")
-    assert not any(
-        "alone" in text for text in build_store(parameters, tmp_path / "s.zarr").warnings
-    )
+    again = build_store(parameters, tmp_path / "s.zarr").warnings
+    assert not any("alone" in text for text in again)
 
 
 @pytest.fixture
@@ -99,9 +96,7 @@ def test_a_scale_beyond_the_bounds_is_told(make_dataset, tmp_path):
 def test_unusual_values_are_told_once_and_recorded(dataset, tmp_path):
     warn = dataset.parameters(pixieverse={"plausibility": "warn"}, ranges="pixie")
     for name in "ab":
-        grid = dataset.assets[name].grid
-        grid[..., 1] /= 1e9
-        dataset.write_grid(name, grid)
+        dataset.write_grid(name, dataset.assets[name].grid / [1, 1e9, 1, 1])
     summary = build_store(dataset.parameters(), tmp_path / "refused.zarr")
     refused = [name for name, why in summary.problems if "the values look like" in why]
     assert sorted(refused) == ["a", "b"]

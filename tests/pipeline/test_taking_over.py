@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from support.faults import flip, inject
 from support.first_builds import tree_from_nothing
-from support.synthetic import Dataset, Made, make_asset
+from support.synthetic import Dataset, Made
 from support.trees import inodes, records_of, tree
 
 from slatprep.inspect.verify import verify_store
@@ -119,10 +119,8 @@ def test_larger_shards_are_made_of_chunks_as_they_are(make_dataset, monkeypatch,
 
 
 def stiffer(dataset: Dataset) -> None:
-    made = make_asset(2)
-    made.grid[..., 1] *= 10
-    dataset.write_grid("h", made.grid)
-    dataset.write_slat("h.npz", made.coords, made.feats)
+    dataset.add("h", seed=2)
+    dataset.write_grid("h", dataset.assets["h"].grid * [1, 10, 1, 1])
 
 
 UPDATES = {
