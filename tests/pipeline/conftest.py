@@ -6,10 +6,15 @@ from pathlib import Path
 import pytest
 from support.faults import inject
 from support.published import IDS, make_published, parameters
-from support.synthetic import Dataset, Made
+from support.synthetic import Dataset, Made, MakeDataset
 from support.trees import tree
 
 from slatprep.pipeline.dataset import build_store
+
+
+@pytest.fixture
+def dataset(make_dataset: MakeDataset) -> Dataset:
+    return make_dataset(*"abcdef")
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.made_store import edit_attributes
-from support.synthetic import Dataset, MakeDataset
+from support.synthetic import Dataset
 from support.trees import records_beside, records_of, tree
 
 from slatprep import build_store, concat_stores, export_store, open_store
@@ -23,11 +23,6 @@ from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, StructuredLatents
 from slatprep.store.integrity import metadata_findings
 
 MEAN, STD = np.array(FEATS_MEAN, np.float32), np.array(FEATS_STD, np.float32)
-
-
-@pytest.fixture
-def dataset(make_dataset: MakeDataset) -> Dataset:
-    return make_dataset(*"abcdef")
 
 
 def rewrite(dataset: Dataset, change: Callable[[np.ndarray], np.ndarray]) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import document, run
-from support.synthetic import Dataset, MakeDataset
+from support.synthetic import Dataset
 
 from slatprep import ConfigError, build_store
 from slatprep.normalize import PIXIE_RANGES, ranges_from_extents
@@ -56,11 +56,6 @@ def test_a_build_that_only_takes_assets_away_tells_of_no_range_again(make_datase
     dataset.remove("a")
     again = build_store(parameters, tmp_path / "s.zarr").warnings
     assert not any("alone" in text for text in again)
-
-
-@pytest.fixture
-def dataset(make_dataset: MakeDataset) -> Dataset:
-    return make_dataset(*"abcdef")
 
 
 def still_channel(dataset: Dataset, name: str) -> None:
