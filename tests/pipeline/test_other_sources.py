@@ -38,6 +38,7 @@ from slatprep.parameters import (
 from slatprep.particles.fields import stored_field
 from slatprep.readers.voxel_sets import field_of_voxels
 from slatprep.records import MATERIAL_COLOURS, PROPERTIES, Contents, Engine
+from slatprep.store import Store
 
 TABLE = [
     {"name": "density", "unit": "kg/m^3", "scale": "log10"},
@@ -99,6 +100,11 @@ def parameters_of(
     return BuildParameters(source, SlatSource(root / "slat"), **usual | groups)  # type: ignore[arg-type]
 
 
+def built(root: Path, adapter: str = "voxels", **groups: Any) -> Store:
+    """Build a store of such parameters, and open it."""
+    return open_store(build_store(parameters_of(root, adapter, **groups), root / "s.zarr").store)
+
+
 @pytest.mark.parametrize(("form", "classes"), [("npz", True), ("hdf5", False)])
 def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form, classes):
     write(tmp_path, "abc", form=form, classes=classes)
@@ -137,8 +143,7 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form,
 
 def test_without_classes_no_accuracy_is_claimed(tmp_path):
     write(tmp_path, "abcdefgh", classes=False)
-    out, trained = tmp_path / "s.zarr", tmp_path / "run"
-    build_store(parameters_of(tmp_path), out)
+    out, trained = built(tmp_path).path, tmp_path / "run"
     summary = train(out, trained, TrainParameters(size="small", epochs=1, precision="fp32"))
     assert np.isnan(summary.history[-1].val_accuracy)
     assert np.isfinite(summary.history[-1].val_loss)
@@ -149,12 +154,10 @@ def test_without_classes_no_accuracy_is_claimed(tmp_path):
 def test_classes_of_a_source_s_own_are_told_by_their_names(tmp_path):
     own = ["soft wood", "steel"]
     write(tmp_path, "ab", classes=own, properties=SOLID)
-    out = tmp_path / "s.zarr"
-    build_store(parameters_of(tmp_path), out)
-    store = open_store(out)
+    store = built(tmp_path)
     assert store.attributes["material_classes"] == own
     assert store.contents.n_classes == 2
-    assert not verify_store(out).findings
+    assert not verify_store(store.path).findings
     found = store_statistics(store)
     counts = np.sum([np.bincount(voxels_of(seed)[2]) for seed in range(2)], axis=0)
     assert [one.name for one in found.classes] == own
@@ -163,21 +166,19 @@ def test_classes_of_a_source_s_own_are_told_by_their_names(tmp_path):
         stored_field(store, "a")
     # Another name is another table: nothing is taken over.
     write_description(tmp_path / "voxels", SOLID, ("a", "b"))
-    build_store(parameters_of(tmp_path), out)
-    assert open_store(out).attributes["material_classes"] == ["a", "b"]
+    assert built(tmp_path).attributes["material_classes"] == ["a", "b"]
 
 
 def test_particles_and_points_take_their_properties_by_name(tmp_path):
     write(tmp_path, "a", properties=SOLID)
-    out = tmp_path / "s.zarr"
-    build_store(parameters_of(tmp_path), out)
-    export_store(out, tmp_path / "ply", "ply")
-    asset = open_store(out).asset("a")
+    store = built(tmp_path)
+    export_store(store, tmp_path / "ply", "ply")
+    asset = store.asset("a")
     rows = PlyData.read(str(tmp_path / "ply" / "a.ply"))["vertex"].data
     for column, name in enumerate(("yield_stress", "E", "density", "nu")):
         np.testing.assert_allclose(rows[name], asset.properties_si[:, column], rtol=1e-6)
     for points in ("slat", "grid"):
-        field = stored_field(open_store(out), "a", points)
+        field = stored_field(store, "a", points)
         assert field.properties[:, 2].max() < 0.5 < field.properties[:, 1].min()
         assert field.properties[:, 0].min() > field.properties[:, 1].max()
 
@@ -195,8 +196,7 @@ def test_other_grids_lie_where_they_should(tmp_path, side):
     arrays = {name: column[rows] for name, column in columns.items()}
     np.savez(tmp_path / "voxels" / "a.npz", voxels=voxels, material=material[rows], **arrays)
     np.save(tmp_path / "voxels" / "frame.npy", QUARTER_TURN)
-    build_store(parameters_of(tmp_path, transform="frame.npy"), tmp_path / "s.zarr")
-    (asset,) = open_store(tmp_path / "s.zarr")
+    (asset,) = built(tmp_path, transform="frame.npy")
     apart, used = cKDTree((voxels + 0.5) / side - 0.5).query(np.asarray(asset.place, np.float64))
     assert apart.max() < 2 / side
     right = np.isclose(asset.properties_si[:, 1], arrays["yield_stress"][used], rtol=0.1)
@@ -210,9 +210,8 @@ def test_vomp_s_voxels_are_read_and_share_the_frame_of_their_latents(tmp_path):
         asset = make_asset(seed)
         coords = np.argwhere(boundary(asset.grid[..., 3] != 7)).astype(np.uint8)
         np.savez(tmp_path / "slat" / f"{name}.npz", coords=coords, feats=asset.feats[: len(coords)])
-    summary = build_store(parameters_of(tmp_path, "vomp", align=KNOWN), tmp_path / "s.zarr")
-    assert summary.verdicts == {"good": 2}
-    store = open_store(tmp_path / "s.zarr")
+    store = built(tmp_path, "vomp", align=KNOWN)
+    assert store.column("verdict").tolist() == ["good", "good"]
     assert store.attributes["material_classes"] == []
     asset = store.asset("a")
     np.testing.assert_array_equal(asset.transform, np.eye(4))
@@ -230,8 +229,7 @@ def test_a_frame_that_is_known_is_checked(tmp_path, suffix):
             np.save(path, frame)
         else:
             path.write_text(json.dumps(frame.tolist()))
-    build_store(parameters_of(tmp_path, transform=f"{{id}}.frame.{suffix}"), tmp_path / "s.zarr")
-    store = open_store(tmp_path / "s.zarr")
+    store = built(tmp_path, transform=f"{{id}}.frame.{suffix}")
     right, wrong = store.asset("a"), store.asset("b")
     assert right.columns["verdict"] == "good" and wrong.columns["verdict"] == "failed"
     assert wrong.columns["confidence"] < 0.5 < 0.9 < right.columns["confidence"]
@@ -296,11 +294,11 @@ def test_what_is_not_there_or_does_not_fit_is_said(tmp_path):
 
 def test_pixie_s_grids_are_not_measured_against_other_properties(tmp_path):
     write(tmp_path, "a")
-    build_store(parameters_of(tmp_path), tmp_path / "s.zarr")
+    out = built(tmp_path).path
     with pytest.raises(ConfigError, match="holds density, yield_stress, friction_angle"):
-        evaluate_store(None, tmp_path / "s.zarr", None, grids={"m": tmp_path / "slat"}, splits={})
-    words = (write_predictions(tmp_path / "p", tmp_path / "s.zarr"), "--store")
-    words = ("evaluate", *words, tmp_path / "s.zarr", "--split", "all", "--beside")
+        evaluate_store(None, out, None, grids={"m": tmp_path / "slat"}, splits={})
+    predictions = write_predictions(tmp_path / "p", out)
+    words = ("evaluate", predictions, "--store", out, "--split", "all", "--beside")
     told = refused(*words, "pixie")
     assert "which the scores of --beside pixie do not" in told
     # Columns of another CSV are those of this store.
@@ -321,8 +319,7 @@ def test_properties_next_to_the_border_of_two_labels_are_verified(tmp_path):
     for name in ("density", "yield_stress"):
         arrays[name] = np.full(len(voxels), 1000.0)
     np.savez(tmp_path / "voxels" / "a.npz", **arrays)
-    out = build_store(parameters_of(tmp_path), tmp_path / "s.zarr").store
-    assert not verify_store(str(out)).findings
+    assert not verify_store(built(tmp_path).path).findings
 
 
 def class_names(count: int) -> list[str]:
@@ -330,13 +327,11 @@ def class_names(count: int) -> list[str]:
 
 
 def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
-    out = tmp_path / "s.zarr"
     write(tmp_path, "ab", classes=class_names(254), properties=HARD, slabs=254)
-    build_store(parameters_of(tmp_path), out)
-    store = open_store(out)
+    store = built(tmp_path)
     assert store.contents.n_classes == 254
     assert store.attributes["background"] == store.contents.background == 254
-    assert not verify_store(out, sources=True).findings
+    assert not verify_store(store.path, sources=True).findings
     counts = np.zeros(254, int)
     for seed, asset in enumerate(store):
         voxels, _, material = voxels_of(seed, 254)
@@ -361,16 +356,14 @@ def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
 
 
 def test_nine_classes_and_other_properties_go_all_the_way_to_scores(tmp_path):
-    out, trained = tmp_path / "s.zarr", tmp_path / "run"
     write(tmp_path, "abcdefgh", classes=class_names(9), properties=HARD, slabs=9)
-    passed = parameters_of(
+    store = built(
         tmp_path,
         sample=SampleParameters(),
         consensus=ConsensusParameters(settle=True),
         witness=WitnessParameters(settle=True),
     )
-    build_store(passed, out)
-    store = open_store(out)
+    out, trained = store.path, tmp_path / "run"
     assert store.contents.background == 254
     assert not verify_store(out).findings
     for form in ("npz", "hdf5", "webdataset"):
