@@ -2,14 +2,13 @@
 
 import json
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.commands import run
+from support.commands import document, run
 from support.trees import copied, tree
 
 from slatprep.errors import StoreError
@@ -108,7 +107,7 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
 
 def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_path):
     options = ("--decoys", 3, "--seed", 1, "--picture", tmp_path / "errors.svg")
-    found = json.loads(run("measure-errors", store.path, *options, "--json").stdout)
+    found = document("measure-errors", store.path, *options)
     assert found["decoys"] == 3 and found["assets"] == len(store)
     assert set(found["errors"]) <= set(store.ids)
     assert (tmp_path / "errors.svg").read_text().startswith("<?xml")
@@ -119,7 +118,7 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     assert "wrong pairs" not in run("list", store.path, "--verdict", "failed").output
     words = ("check-alignment", "--asset", asset_id, "--store", store.path, "--picture", "none")
     assert "the probability of another object" not in run(*words).output
-    assert "another_object" not in json.loads(run(*words, "--json").stdout)["assets"][0]
+    assert "another_object" not in document(*words)["assets"][0]
     told = run("measure-errors", store.path, *options).output
     assert "Assets that can be kept" not in told and "Most likely another" not in told
     others = tuple(replace(one, verdict="failed") for one in measured.decoys)
@@ -127,7 +126,7 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(decoys, "measured_errors", lambda _: telling)
         assert telling.of_asset(asset_id) in run(*words).output
-        (found,) = json.loads(run(*words, "--json").stdout)["assets"]
+        (found,) = document(*words)["assets"]
     assert found["another_object"] == measured.errors.get(asset_id, 0.0)
     assert "is below 0.1%" in replace(measured, errors={}).of_asset(asset_id)
     assert "is 25.0%" in replace(measured, errors={asset_id: 0.25}).of_asset(asset_id)
@@ -237,9 +236,7 @@ def test_a_small_update_measures_nothing_and_a_larger_one_takes_decoys_over(make
     assert (manifests_of(out) / ERRORS).read_bytes() == text
     assert told_of(store)[-1].startswith("measured before the last update, when there were 6")
     other = dataset.parameters(align={"radius": 2.0})
-    other_store = tmp_path / "other.zarr"
-    shutil.copytree(out, other_store)
-    shutil.copytree(manifests_of(out), manifests_of(other_store))
+    other_store = copied(out, tmp_path / "other.zarr")
     build_store(other, other_store, decoys=0)
     assert told_of(open_store(other_store))[0].startswith("not measured; ")
     for seed, name in enumerate(("hen", "ibis"), 8):
