@@ -317,14 +317,11 @@ def test_a_zarr_group_that_cannot_be_listed_is_its_own_fault_alone(root, name, m
         load_source(root / name, root, "grid")
 
 
-def test_a_ply_that_claims_more_than_it_has_is_refused(root):
+def test_a_ply_without_a_column_of_the_table_is_refused(root):
     columns = {axis: np.zeros(3, np.float32) for axis in "xyz"}
     rest = {"density": np.ones(3, np.float32), "damping": np.ones(3, np.float32)}
     sources.write_points(root / "a.ply", columns | rest)
     refused(root, "has no property 'material'")
-    text = (root / "a.ply").read_bytes().replace(b"vertex 3", b"vertex 99999999999")
-    (root / "a.ply").write_bytes(text)
-    refused(root, "announces more rows than it has")
 
 
 HANDLE = {"density": "7.8 g/cm^3", "Young's Modulus (GPa)": "200", "Poisson's Ratio": "0.29"}
