@@ -24,7 +24,8 @@ from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.write import write_annotated, write_slat
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import build_store
-from slatprep.pipeline.decoys import measure_errors, told_of
+from slatprep.pipeline.decoys import measure_errors
+from slatprep.pipeline.measured import told_of
 from slatprep.records import RESOLUTION
 from slatprep.store import open_store
 

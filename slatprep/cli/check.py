@@ -17,7 +17,7 @@ from slatprep.cli.signature import command
 
 if TYPE_CHECKING:
     from slatprep.inspect.check import AlignmentCheck
-    from slatprep.pipeline.decoys import MeasuredErrors
+    from slatprep.pipeline.measured import MeasuredErrors
     from slatprep.records import Place
     from slatprep.store import Store
 
@@ -72,7 +72,7 @@ def check_alignment(
         raise click.UsageError("STORE and --store both name the store; give one of them")
     path = options.chosen_store(store or named)
     from slatprep.inspect import check
-    from slatprep.pipeline.decoys import measured_errors
+    from slatprep.pipeline.measured import measured_errors
     from slatprep.pipeline.rows import SourceStore
     from slatprep.workers.local import run_in_order
 

@@ -30,7 +30,7 @@ def info(output: Output, store: options.LastStore) -> None:
     slatprep info data/demo.zarr
     """
     from slatprep.inspect.overview import overview_of
-    from slatprep.pipeline.decoys import told_of
+    from slatprep.pipeline.measured import told_of
     from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)
@@ -107,7 +107,7 @@ def show_quality(
 
 def show_errors(store: Store) -> None:
     """Print how many of a store's verdicts are wrong, as measured on decoys."""
-    from slatprep.pipeline.decoys import told_of
+    from slatprep.pipeline.measured import told_of
 
     for sentence in told_of(store):
         say(f"wrong pairs: {sentence}")
@@ -165,7 +165,7 @@ def list_assets(
     slatprep list data/demo.zarr --category tree --ids
     """
     from slatprep.inspect.overview import list_assets as listed_of
-    from slatprep.pipeline.decoys import errors_of
+    from slatprep.pipeline.measured import errors_of
     from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from slatprep.errors import SlatprepError, StoreError
+from slatprep.pipeline.destination import Destination
 from slatprep.pipeline.plan import Crew
-from slatprep.pipeline.publish import Destination
 from slatprep.pipeline.recipe import Recipe, Wanted
 from slatprep.pipeline.rows import NextStore, Row, SourceStore, checked_store
 from slatprep.pipeline.seen import bound_to, look, read_seen, write_seen

@@ -18,7 +18,9 @@ from slatprep.errors import ConfigError, SlatprepError
 from slatprep.parameters import BuildParameters
 from slatprep.parameters.files import checked
 from slatprep.pipeline.before import SHARE, Before, look_back
-from slatprep.pipeline.decoys import DECOYS, measure_build, writable_file
+from slatprep.pipeline.decoys import DECOYS, measure_build
+from slatprep.pipeline.destination import Destination, require_free
+from slatprep.pipeline.measured import writable_file
 from slatprep.pipeline.notices import dataset_notices, moved_ranges, much_clipped
 from slatprep.pipeline.pack import pack_store
 from slatprep.pipeline.plan import (
@@ -31,14 +33,7 @@ from slatprep.pipeline.plan import (
     plan_assets,
     why_taken_out,
 )
-from slatprep.pipeline.publish import (
-    BuildSummary,
-    Destination,
-    counts_of,
-    publish_build,
-    require_free,
-    summarise,
-)
+from slatprep.pipeline.publish import BuildSummary, counts_of, publish_build, summarise
 from slatprep.pipeline.recipe import Wanted, recipe_of
 from slatprep.pipeline.rows import NextStore, Row
 from slatprep.pipeline.settle import check_objects, kept_rows, settle_rows

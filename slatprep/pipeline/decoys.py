@@ -8,29 +8,33 @@ before, and takes over what was measured on them.
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.errors import SlatprepError, StoreError, amount
+from slatprep.errors import SlatprepError, StoreError
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
+from slatprep.pipeline.measured import (
+    LEAST_TOLD,
+    Decoy,
+    Kept,
+    MeasuredErrors,
+    measured_errors,
+    why_no_decoys,
+    writable_file,
+    write_errors,
+)
 from slatprep.pipeline.plan import Crew
-from slatprep.pipeline.publish import require_free
 from slatprep.pipeline.rows import SourceStore, slat_contents
-from slatprep.records import Engine, Number, Place, Share, Verdict
-from slatprep.storage.atomic import writing
-from slatprep.storage.documents import read_as, read_bounded
+from slatprep.records import Verdict
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
-from slatprep.store.reader import require_beside
 from slatprep.store.record import StageParameters
-from slatprep.store.records import ERRORS, StoredRecords, manifests_of
+from slatprep.store.records import StoredRecords
 from slatprep.workers import Progress, counted
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -42,141 +46,14 @@ EVERY, SPARSELY = 20, 60
 second as soon as it gives more. A decoy takes three times as long as an asset. So a build of 2,400
 assets or more takes 5 % longer, and one of 800 takes 15 %."""
 
-ALIKE = 0.2
-"""Least share of decoys called good at which objects are too much alike for decoys to tell."""
-
 RATES = (0.001, 0.01, 0.05)
 """Shares of wrong assets for which the number of assets that may be kept is computed."""
-
-LEAST_TOLD = 0.001
-"""Least probability of an error that is kept for an asset."""
 
 _TAKEN_OVER = ("refitted", "wrong_share", "wrong_share_range", "good", "good_wrong",
                "good_wrong_range")  # fmt: skip
 """Fields that are copied from `slatprep.judge.decoys.ErrorRates`."""
 
 BINS = 40
-_MAX_BYTES = 64 * 2**20
-
-
-@dataclass(frozen=True)
-class Decoy:
-    """An asset's grid and another asset's SLAT, both by their ids.
-
-    `keys` are the keys of the two assets. `verdict` is the verdict on the decoy's alignment, as for
-    an asset. `evidence` has the alignment's `slatprep.judge.evidence.FIGURES`; it is empty before
-    the decoy is aligned.
-    """
-
-    grid: str
-    slat: str
-    keys: tuple[str, str]
-    verdict: str = ""
-    evidence: tuple[Number, ...] = ()
-
-
-@dataclass(frozen=True)
-class Kept:
-    """Number of assets that may be kept at a share of wrong assets, and their least score."""
-
-    rate: float
-    assets: int
-    score: Number
-
-
-@dataclass(frozen=True)
-class MeasuredErrors:
-    """The errors of a store's alignments, as the file `ERRORS` keeps them.
-
-    Attributes
-    ----------
-    build : str
-        Id of the build that was measured.
-    seed : int
-        Seed of the draw of decoys.
-    assets : int
-        Number of assets that the store had.
-    refitted : bool
-        Whether the score was learned on the dataset; else the shipped model gives it.
-    wrong_share : float
-        Share of all assets that show another object.
-    good : int
-        Number of assets called good.
-    good_wrong : float
-        Number of assets called good that show another object.
-    wrong_share_range, good_wrong_range : tuple of float
-        Intervals that contain these two with a probability of 0.95.
-    kept : tuple of Kept
-        Assets that may be kept, for each of `RATES`.
-    errors : dict of str to float
-        Posterior probability that an asset shows another object, by id, if it is at least
-        `LEAST_TOLD`.
-    edges, targets, counts : tuple
-        Histogram of the scores (logarithms of odds): edges, and assets and decoys in between.
-    decoys : tuple of Decoy
-        The decoys on which the errors were measured.
-    """
-
-    build: str
-    seed: int
-    assets: int
-    refitted: bool
-    wrong_share: Share
-    wrong_share_range: tuple[float, float]
-    good: int
-    good_wrong: float
-    good_wrong_range: tuple[float, float]
-    kept: tuple[Kept, ...]
-    errors: dict[str, float]
-    edges: tuple[float, ...]
-    targets: tuple[int, ...]
-    counts: tuple[int, ...]
-    decoys: tuple[Decoy, ...]
-
-    @property
-    def passed(self) -> int:
-        """Number of decoys called good."""
-        return sum(one.verdict == Verdict.GOOD for one in self.decoys)
-
-    @property
-    def alike(self) -> bool:
-        """Whether objects are too much alike for decoys to tell."""
-        return self.passed >= ALIKE * len(self.decoys)
-
-    @property
-    def tells(self) -> bool:
-        """Whether decoys tell how many assets, and which, show another object."""
-        return self.refitted and not self.alike
-
-    def sentences(self) -> list[str]:
-        """Say in words what was measured."""
-        low, high = self.good_wrong_range
-        shares = self.wrong_share_range
-        if self.alike:
-            return [
-                f"decoys cannot tell how many of the {self.good:,} called good show another "
-                f"object: {self.passed:,} of {len(self.decoys):,} decoys are called good, too, as "
-                "objects of this dataset are alike"
-            ]
-        if not self.tells:
-            return [
-                f"likely at most {math.ceil(high):,} of the {self.good:,} called good show another "
-                f"object, and at most {shares[1]:.1%} of all assets",
-                f"measured on {amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')}"
-                f"; an estimate needs at least {LEAST_DECOYS} decoys and {LEAST_TARGETS} assets",
-            ]
-        return [
-            f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "
-            f"({low:.0f} to {high:.0f}; measured on {len(self.decoys):,} decoys of this dataset)",
-            f"of all {self.assets:,} assets about {self.wrong_share:.1%} show another object "
-            f"({shares[0]:.1%} to {shares[1]:.1%})",
-        ]
-
-    def of_asset(self, asset_id: str) -> str:
-        """Say how probable it is that an asset shows another object; valid only if this `tells`."""
-        error = self.errors.get(asset_id)
-        likely = f"below {LEAST_TOLD:.1%}" if error is None else f"{error:.1%}"
-        return f"by the decoys of its dataset, the probability of another object is {likely}"
 
 
 def measure_errors(
@@ -224,7 +101,7 @@ def measure_errors(
     from slatprep.judge.decoys import FOLDS, error_rates
     from slatprep.judge.witness import fold_of
 
-    if reason := _no_decoys(store):
+    if reason := why_no_decoys(store):
         raise StoreError(f"{store.path}: {reason}")
     if (file := storage_of(writable_file(store.path)).local) is not None:
         there = next(one for one in file.parents if one.exists())
@@ -269,7 +146,7 @@ def measure_errors(
         counts=tuple(np.histogram(rates.decoy_scores, edges)[0].tolist()),
         decoys=made,
     )
-    _write(store, result)
+    write_errors(store, result)
     return result
 
 
@@ -284,9 +161,9 @@ def measure_build(
     """
     measured = measured_errors(store.path) or (measured_errors(before.path) if before else None)
     new = min(allowed_decoys(aligned), most)
-    if new == 0 or len(store) < LEAST_TARGETS or _no_decoys(store):
+    if new == 0 or len(store) < LEAST_TARGETS or why_no_decoys(store):
         if measured:
-            _write(store, measured)
+            write_errors(store, measured)
         return
     crew.tell(f"measuring errors on at most {new:,} new decoys")
     # A person may have asked for more decoys before; their number is kept.
@@ -298,15 +175,6 @@ def measure_build(
 def allowed_decoys(assets: int) -> int:
     """Return how many decoys a build of so many assets may align; see `EVERY`."""
     return max(min(assets // EVERY, LEAST_DECOYS), assets // SPARSELY)
-
-
-def _no_decoys(store: Store) -> str:
-    """Say why a store can have no decoys; empty if it can."""
-    if len(set(map(str, store.column("object_id")))) < 2:
-        return "decoys need at least two objects, and it has one"
-    if str(Engine.KNOWN) in store.column("engine"):
-        return "its transforms were given, so decoys of it cannot be aligned"
-    return ""
 
 
 def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.float64]]:
@@ -389,72 +257,3 @@ def fail_decoy(
         f"{store.path}: the decoy of {decoy.grid} with the SLAT of {decoy.slat} killed its worker "
         "process twice, probably because memory ran out"
     )
-
-
-def file_of(store: Place) -> Place:
-    """Return the file of a store's errors; ``demo`` and ``demo.zarr`` share a folder."""
-    local = storage_of(store).local
-    name = "" if local is None else local.resolve().name
-    own = name and not name.endswith(".zarr")
-    return manifests_of(store) / (f"{name}.{ERRORS}" if own else ERRORS)
-
-
-def measured_errors(store: Place) -> MeasuredErrors | None:
-    """Return the last measurement of a store, perhaps from before an update; None if none."""
-    try:
-        text = read_bounded(file_of(store), _MAX_BYTES)
-        return read_as(MeasuredErrors, text)
-    except (OSError, ValueError):
-        return None  # The errors are measured anew.
-
-
-def errors_of(store: Store) -> MeasuredErrors | None:
-    """Return the last measurement of a store if any of its decoys is still one, else None."""
-    measured = measured_errors(store.path)
-    if measured is None or not measured.decoys or measured.build == store.about.manifest:
-        return measured
-    records = StoredRecords(store)
-
-    def key_of(asset_id: str) -> str:
-        with suppress(StoreError):  # It is not there, or damaged.
-            return records.of(asset_id).key
-        return ""
-
-    still = any(one.keys == (key_of(one.grid), key_of(one.slat)) for one in measured.decoys)
-    # Otherwise another dataset lay at this place, or all assets were aligned with other parameters.
-    return measured if still else None
-
-
-def told_of(store: Store) -> list[str]:
-    """Return sentences on what is known of a store's errors, or on why nothing is known."""
-    measured = errors_of(store)
-    if measured is None:
-        if reason := _no_decoys(store):
-            return [f"not measured: {reason}"]
-        few = len(store) < LEAST_TARGETS
-        too = f", and so does a build of {LEAST_TARGETS} assets or more" if few else ""
-        return [f"not measured; `slatprep measure-errors` does it{too}"]
-    told = measured.sentences()
-    if measured.build != store.about.manifest:
-        told.append(
-            f"measured before the last update, when there were {measured.assets:,} assets; "
-            "`slatprep measure-errors` counts them anew"
-        )
-    return told
-
-
-def writable_file(store: Place) -> Place:
-    """Return `file_of` a store; raise SlatprepError if a file of other origin is there."""
-    file = file_of(store)
-    local = storage_of(file).local
-    if local is not None:
-        require_beside(local.parent)
-        require_free(local, mark=ERRORS)
-    return file
-
-
-def _write(store: Store, measured: MeasuredErrors) -> None:
-    """Write a measurement beside the store."""
-    file = writable_file(store.path)
-    with writing(str(file), file.parent), storage_of(file).staged() as path:
-        path.write_bytes(orjson.dumps(measured, option=orjson.OPT_INDENT_2) + b"\n")

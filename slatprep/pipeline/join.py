@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError, tally
 from slatprep.normalize import ranges_from_bounds, ranges_from_extents
 from slatprep.parameters import BuildParameters
+from slatprep.pipeline.destination import Destination
 from slatprep.pipeline.notices import moved_ranges
 from slatprep.pipeline.pack import pack_store
-from slatprep.pipeline.publish import BuildSummary, Destination, publish_build
+from slatprep.pipeline.publish import BuildSummary, publish_build
 from slatprep.pipeline.rows import NextStore, Row, SourceStore, in_order
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside

@@ -18,7 +18,7 @@ from slatprep.normalize import (
     normalize_change,
     normalize_properties,
 )
-from slatprep.pipeline.publish import Destination
+from slatprep.pipeline.destination import Destination
 from slatprep.pipeline.rows import NextStore, SourceStore, Where, record_text
 from slatprep.pipeline.spool import Spool
 from slatprep.pipeline.work import Work

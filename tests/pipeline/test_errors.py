@@ -15,13 +15,8 @@ from slatprep.errors import StoreError
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
-from slatprep.pipeline.decoys import (
-    allowed_decoys,
-    draw_decoys,
-    measure_errors,
-    measured_errors,
-    told_of,
-)
+from slatprep.pipeline.decoys import allowed_decoys, draw_decoys, measure_errors
+from slatprep.pipeline.measured import measured_errors, told_of
 from slatprep.store import Store, open_store
 from slatprep.store.records import ERRORS, manifests_of
 
@@ -124,7 +119,7 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     others = tuple(replace(one, verdict="failed") for one in measured.decoys)
     telling = replace(measured, decoys=others, refitted=True)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(decoys, "measured_errors", lambda _: telling)
+        patched.setattr("slatprep.pipeline.measured.measured_errors", lambda _: telling)
         assert telling.of_asset(asset_id) in run(*words).output
         (found,) = document(*words)["assets"]
     assert found["another_object"] == measured.errors.get(asset_id, 0.0)
@@ -154,6 +149,7 @@ OBJECTS = ("ant", "bear", "cup", "dog", "eel", "fox")
 def few_suffice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let six assets be enough, and every second one have a decoy."""
     monkeypatch.setattr(decoys, "LEAST_TARGETS", 4)
+    monkeypatch.setattr("slatprep.pipeline.measured.LEAST_TARGETS", 4)
     monkeypatch.setattr(decoys, "EVERY", 2)
 
 

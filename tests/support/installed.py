@@ -1,5 +1,6 @@
 """Packages with adapters of their own, as somebody would have installed them."""
 
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,3 +27,5 @@ def package(
     yield
     for cached in (adapters._known, adapters._loaded):
         cached.cache_clear()
+    for module in modules:
+        sys.modules.pop(module, None)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.statistics import Histogram, JointHistogram, StoreStatistics
-from slatprep.pipeline.decoys import MeasuredErrors
+from slatprep.pipeline.measured import MeasuredErrors
 from slatprep.records import MATERIAL_CLASSES, MATERIAL_COLOURS, Property
 from slatprep.store.reader import Store
 

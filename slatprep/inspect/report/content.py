@@ -23,7 +23,7 @@ from slatprep.inspect.report.drawn import BINS, COLUMNS, LEVELS, PER_SHEET, VIEW
 from slatprep.inspect.tallies import Tally, no_tally
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
-from slatprep.pipeline.decoys import errors_of, told_of
+from slatprep.pipeline.measured import errors_of, told_of
 from slatprep.pipeline.notices import shared_sources
 from slatprep.pipeline.rows import slat_contents
 from slatprep.records import MATERIAL_COLOURS, UNANNOTATED_COLOUR, Place, Status
