@@ -106,7 +106,8 @@ class StoreDifference:
     a, b : Place
         The stores.
     same : bool
-        Whether there are no differences.
+        Whether there are no differences. Grids are not read: the digests of their sources stand for
+        them.
     settings : tuple of Setting
         Attributes that differ: format, ranges, parameters, versions, the digest of the records.
     only_a, only_b : tuple of str

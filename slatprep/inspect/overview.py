@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import apart_from
 from slatprep.judge import THRESHOLDS
 from slatprep.records import Normalization, Place, Verdict
 from slatprep.storage.place import storage_of
@@ -93,7 +94,8 @@ def overview_of(store: Store) -> StoreOverview:
         normalization=store.normalization,
         total=_group("all", columns, list(range(len(store)))),
         categories=tuple(
-            _group(name or UNKNOWN, columns, own) for name, own in sorted(rows.items())
+            _group(apart_from(name, (UNKNOWN, "all")) or UNKNOWN, columns, own)
+            for name, own in sorted(rows.items())
         ),
     )
 

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import require_one_of
+from slatprep.errors import apart_from, require_one_of
 from slatprep.inspect.overview import UNKNOWN
 from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
 from slatprep.pipeline.rows import SourceStore
@@ -228,7 +228,8 @@ def store_statistics(
             if progress:
                 progress(done, len(rows))
         total += here
-        groups.append(_group(store, "category", category or UNKNOWN, here, verdicts_here))
+        name = apart_from(category, (UNKNOWN, "all")) or UNKNOWN
+        groups.append(_group(store, "category", name, here, verdicts_here))
     everything = _group(store, "all", "all", total, Counter(verdict_of[row] for row in rows))
     classes = [_group(store, "class", name, total, None, k) for k, name in enumerate(labels)]
     whole = everything.field.share, everything.slat.share

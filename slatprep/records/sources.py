@@ -259,7 +259,7 @@ class MaterialField:
     classified: bool = True
 
 
-_ODDITY = re.compile(r"unusual (values|masks|places|latents): (.+)", re.DOTALL)
+_ODDITY = re.compile(r"(sample .+?: )?unusual (values|masks|places|latents): (.+)", re.DOTALL)
 
 
 def oddity(kind: str, text: str) -> str:
@@ -272,8 +272,9 @@ def oddity(kind: str, text: str) -> str:
 
 def oddities_in(warnings: Iterable[str]) -> dict[str, str]:
     """Return the first text of each kind of `oddity` among warnings, in one line, by kind."""
-    found = [match for one in warnings if (match := _ODDITY.search(one))]
-    return dict(sorted({match[1]: " ".join(match[2].split()) for match in reversed(found)}.items()))
+    found = [match for one in warnings if (match := _ODDITY.match(one))]
+    texts = {one[2]: " ".join(f"{one[1] or ''}{one[3]}".split()) for one in reversed(found)}
+    return dict(sorted(texts.items()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -222,6 +222,32 @@ def test_a_picture_is_the_same_each_time_and_takes_any_name_and_unit(store, tmp_
     }  # fmt: skip
 
 
+def test_categories_that_share_a_name_with_other_rows_have_rows_of_their_own(store, tmp_path):
+    copy = Path(shutil.copytree(store, tmp_path / "s.zarr"))
+    names = np.array(["", "(unknown)", "all", "b", "b"], dtype=object)
+    rewrite(copy, "asset/category", slice(None), names)
+    opened = open_store(copy)
+    expected = [("(unknown)", 1), ('"(unknown)"', 1), ('"all"', 1), ("b", 2)]
+    found = statistics.store_statistics(opened).categories
+    assert [(one.name, one.slat.assets) for one in found] == expected
+    assert [(one.name, one.assets) for one in overview_of(opened).categories] == expected
+    assert "the category of 1" in run("info", copy).stdout
+
+
+def test_the_legend_of_many_classes_names_the_commonest(store):
+    found = statistics.store_statistics(open_store(store))
+    sizes = [0, 5, 2, 9, *range(10, 40)]
+    made = [
+        replace(
+            found.classes[0], name=f"class {k}", field=replace(found.classes[0].field, voxels=n)
+        )
+        for k, n in enumerate(sizes)
+    ]
+    picture = draw_statistics(open_store(store), replace(found, classes=tuple(made)), "svg")
+    named = re.findall(r"<!-- class (\d+) -->", picture.decode())
+    assert len(named) < len(sizes) and named[:3] == ["33", "32", "31"]
+
+
 def test_nothing_chosen_is_nothing_counted(store, tmp_path):
     words = ("stats", store, "--verdict", "failed", "--category", "b")
     assert run(*words, "--picture", tmp_path / "p.png").stdout.startswith("0 of 5 assets")

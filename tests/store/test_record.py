@@ -14,7 +14,7 @@ import pytest
 from support.made_store import BUILD_ID, GONE, placed
 
 from slatprep.pipeline.dataset import BuildSummary
-from slatprep.records import PIXIEVERSE, LatentSpace, Property
+from slatprep.records import PIXIEVERSE, LatentSpace, Property, oddities_in
 from slatprep.storage.documents import adapter_of
 from slatprep.store import open_store
 from slatprep.store.attributes import RootAttributes, read_attributes, segments_of, width_findings
@@ -129,6 +129,14 @@ def test_text_that_is_no_json_is_refused():
     for text in ("", "{", "[]", "null", '{"status": NaN}', b"\xff"):
         with pytest.raises(RecordError):
             read_record(AssetRecord, text, "here")
+
+
+def test_what_is_unusual_of_a_merged_annotation_names_it():
+    warnings = ["sample 2: unusual values: class sand has\n3 Pa", "unusual values: other", "a word"]
+    assert oddities_in(warnings) == {"values": "sample 2: class sand has 3 Pa"}
+    assert oddities_in(["sample 0 has no unusual masks: none", "unusual masks: b"]) == {
+        "masks": "b"
+    }
 
 
 def test_nan_is_null(record):

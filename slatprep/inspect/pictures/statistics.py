@@ -70,11 +70,11 @@ def _head(figure: Figure, store: Store, statistics: StoreStatistics) -> None:
         f"not valid: {_percent(statistics.total.slat.unannotated)} after"
     )
     canvas.note(figure, 40, 74, words)
-    entries = [
-        (group.name, colour)
-        for group, colour in zip(statistics.classes, _COLOURS, strict=False)
-        if len(statistics.classes) <= len(MATERIAL_CLASSES) or group.field.voxels
-    ]
+    coloured = [*zip(statistics.classes, _COLOURS, strict=False)]
+    if len(coloured) > len(MATERIAL_CLASSES):  # There is space for the commonest alone.
+        there = (one for one in coloured if one[0].field.voxels)
+        coloured = sorted(there, key=lambda one: -one[0].field.voxels)
+    entries = [(group.name, colour) for group, colour in coloured]
     canvas.draw_legend(figure, entries, (40, 103, _WIDTH - 40))
     for column, (_, title) in enumerate(_SIDES):
         left = _LEFT + column * (_PLOT + _GAP)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from PIL import Image
-from support.made_store import edit_record
+from support.made_store import edit_record, rewrite
 from support.pages import HOSTILE, Page, Report
 from support.synthetic import Dataset, MakeDataset
 
@@ -25,6 +25,7 @@ from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
+from slatprep.store.records import manifests_of
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
@@ -204,6 +205,39 @@ def test_a_reason_is_shown_without_its_path(browser, mixed_build, tmp_path):
     whole, told = cell.get_attribute("title"), "the SLAT is empty; expected at least one voxel"
     assert whole.startswith("/") and whole.endswith(f"torn.npz: {told}")
     assert cell.text == f"not built\n{told}"
+
+
+def test_each_line_of_reasons_shows_its_own_assets(browser, copy, tmp_path):
+    why = {"reasons": ["only 51.4% of the labels can be expected to be right"]}
+    for row, verdict in enumerate(("doubtful", "failed", "failed")):
+        rewrite(copy, "asset/verdict", row, verdict)
+        edit_record(
+            copy, row, lambda one, verdict=verdict: one["judgement"].update(why, verdict=verdict)
+        )
+    page = Report(copy, Path(str(manifests_of(copy))), tmp_path / "page.html")
+    write_report(open_store(copy), page.path, manifests=page.manifests)
+    open_page(browser, page)
+    lines = browser.execute_script("return document.querySelectorAll('#why button').length")
+    numbers = [
+        one.get_attribute("textContent")
+        for one in browser.find_elements("css selector", "#why .number")
+    ]
+    assert {"1", "2"} <= {*numbers} and lines == len(numbers)
+    for number, line in zip(numbers, range(lines), strict=True):
+        browser.execute_script(f"document.querySelectorAll('#why button')[{line}].click()")
+        assert len(rows(browser)) == int(number)
+
+
+@pytest.mark.parametrize(("call", "text"), [
+    ("scientific(5.99990)", "1.0 \u00d7 10⁶"), ("scientific(-5.2)", "6.3 \u00d7 10⁻⁶"),
+    ("scientific(2.9999)", "1000"), ("scientific(2)", "100"),
+    ("within({lo: 1e-5, hi: 3e-5})(1e-5)", "0.0000100"),
+    ("within({lo: 0.21, hi: 0.449})(0.3333)", "0.333"),
+    ("within({lo: -40, hi: 1234567})(-7)", "\u22127"),
+    ("within({lo: 1e6, hi: 3e7})(2345678)", "2,345,678"),
+])  # fmt: skip
+def test_numbers_have_the_digits_that_tell_them_apart(opened, call, text):
+    assert opened.execute_script(f"return Format.{call}") == text
 
 
 def test_it_opens_an_asset_that_turns(opened):

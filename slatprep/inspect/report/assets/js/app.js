@@ -49,8 +49,8 @@ const Filter = (() => {
   }
 
   /** Show only what has this, and bring the table into view. */
-  function only(key, value) {
-    chosen = { ...initial(), [key]: value };
+  function only(change) {
+    chosen = { ...initial(), ...change };
     apply();
     byId("assets").scrollIntoView();
   }

@@ -12,6 +12,9 @@ const STATES = [
   { name: "skipped", sign: "–", means: "a partner is missing, not in the store" },
 ];
 
+/** The states of what is in the store. */
+const STORED = STATES.slice(0, 3).map((state) => state.name);
+
 /** Say what is unusual of an asset's sources, a text for each kind. */
 const unusualOf = (index) => (ASSETS.unusual[index] ?? []).map((line) => `unusual ${line}`);
 

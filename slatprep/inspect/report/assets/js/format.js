@@ -33,9 +33,15 @@ const Format = (() => {
   /** An SI value from its mapped one: 10^7.3 as 2.0 × 10⁷. */
   const scientific = (exponent) => {
     const power = Math.floor(exponent + 1e-9);
-    const mantissa = 10 ** (exponent - power);
     if (power >= 0 && power < 4) return String(Number((10 ** exponent).toPrecision(3)));
-    return `${mantissa.toFixed(1)} × 10${superscript(power)}`;
+    const [mantissa, rounded] = (10 ** exponent).toExponential(1).split("e");
+    return `${mantissa} × 10${superscript(Number(rounded))}`;
+  };
+  /** Values between two ends, all with the digits that tell a hundredth of the range. */
+  const within = ({ lo, hi }) => {
+    const digits = Math.min(Math.max(2 - Math.floor(Math.log10(hi - lo)), 0), 20);
+    const numbers = new Intl.NumberFormat("en-GB", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+    return (x) => numbers.format(x).replace("-", "−");
   };
   const power = (exponent) => `10${superscript(exponent)}`;
   const quantile = (values, q) => {
@@ -49,5 +55,5 @@ const Format = (() => {
   const extent = (values) => values.reduce(([lo, hi], x) => [Math.min(lo, x), Math.max(hi, x)], [Infinity, -Infinity]);
   const plural = (n, one, many = `${one}s`) => `${count(n)} ${n === 1 ? one : many}`;
   const annotations = (merged) => (!merged ? NONE : merged[0] === merged[1] ? count(merged[0]) : `${count(merged[0])} of ${count(merged[1])}`);
-  return { NONE, annotations, count, fixed, share, scientific, power, quantile, extent, plural };
+  return { NONE, annotations, count, fixed, share, scientific, within, power, quantile, extent, plural };
 })();

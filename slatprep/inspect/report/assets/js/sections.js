@@ -1,7 +1,7 @@
 /* What stands above the table: states, quality, properties, classes. */
 
 const Sections = (() => {
-  const stored = ASSETS.state.map((state) => state !== "not built" && state !== "skipped");
+  const stored = ASSETS.state.map((state) => STORED.includes(state));
   const known = (values) => values.filter((value) => value !== null);
 
   function states(filter) {
@@ -32,12 +32,12 @@ const Sections = (() => {
       ...present.map((state) => el("i", { "data-state": state.name, title: `${state.name}: ${state.count}`, style: { flex: `${state.count} 0 0`, background: "var(--tone)" } })),
     );
     byId("statelist").replaceChildren(
-      ...counts.map((state) =>
-        el("button", { type: "button", class: "chip", title: state.means, onclick: () => filter.only("states", [state.name]) }, stateTag(state.name), ` ${Format.count(state.count)}`),
+      ...counts.filter((state) => CONTENT.records || STORED.includes(state.name)).map((state) =>
+        el("button", { type: "button", class: "chip", title: state.means, onclick: () => filter.only({ states: [state.name] }) }, stateTag(state.name), ` ${Format.count(state.count)}`),
       ),
     );
     if (unusual) {
-      byId("statelist").append(el("button", { type: "button", class: "chip", title: "values, masks, places or latents that few sources have", onclick: () => filter.only("unusual", true) }, `⚠ unusual ${Format.count(unusual)}`));
+      byId("statelist").append(el("button", { type: "button", class: "chip", title: "values, masks, places or latents that few sources have", onclick: () => filter.only({ unusual: true }) }, `⚠ unusual ${Format.count(unusual)}`));
     }
     byId("statelist").append(...CONTENT.shared.map((line) => el("p", { class: "hint", style: { flex: "1 0 100%" } }, `⚠ ${line}`)));
     why(filter);
@@ -66,7 +66,7 @@ const Sections = (() => {
       list.append(
         el("span", { class: "number" }, Format.count(row.count)),
         stateTag(row.state),
-        el("button", { type: "button", class: "link", title: row.example, onclick: () => filter.only("kind", row.kind) }, text),
+        el("button", { type: "button", class: "link", title: row.example, onclick: () => filter.only({ states: [row.state], kind: row.kind }) }, text),
       );
     }
     byId("why").replaceChildren(list);
@@ -148,7 +148,7 @@ const Sections = (() => {
     const few = found.slice(0, 12);
     const rows = few.map((one) => ({
       label: one.words,
-      choose: () => filter.only("turn", one.turn),
+      choose: () => filter.only({ turn: one.turn }),
       parts: [{ share: one.count / most, title: `${one.words}: ${Format.plural(one.count, "asset")}` }],
       number: `${Format.share(one.count / total)} · tilt ${Format.quantile(one.tilts, 0.5).toFixed(1)}°`,
     }));
@@ -161,7 +161,7 @@ const Sections = (() => {
 
   function properties() {
     const source = CONTENT.properties[0].source;
-    const range = { dataset: "the smallest and largest value of this dataset", pixie: "Pixie's published ranges" }[source] ?? (/^(p\d|dataset of)/.test(source) ? source : `the file ${source}`);
+    const range = { dataset: "the smallest and largest value of the dataset that was built", pixie: "Pixie's published ranges" }[source] ?? (/^(p\d|dataset of)/.test(source) ? source : `the file ${source}`);
     byId("properties-hint").textContent =
       `Before: the annotated voxels of the PixieVerse fields in physical units, not normalised. After: the valid SLAT voxels as the store holds them. ` +
       `Solid lines mark the range that becomes −1 to 1 (${range}); dashed lines, Pixie's published range.`;
@@ -174,7 +174,7 @@ const Sections = (() => {
     const totals = parts.map((own) => own.reduce((sum, part) => sum + part.count, 0));
     const all = totals.reduce((sum, count) => sum + count, 0);
     const largest = (k) => CONTENT.classes[parts[k].reduce((best, part, id) => (part.count > parts[k][best].count ? id : best), 0)].name;
-    const say = (k) => `${Format.share(totals[k] / all)} of the voxels, most of them ${largest(k)}`;
+    const say = (k) => `${Format.share(totals[k] / all)} of the voxels, most often ${largest(k)}`;
     return { parts, all, say };
   }
 
@@ -187,7 +187,7 @@ const Sections = (() => {
     const domain = [lo - margin, hi + margin];
     const edge = (k) => property.lo + ((property.hi - property.lo) * k) / parts.length;
     const edges = Array.from({ length: parts.length + 1 }, (_, k) => edge(k));
-    const text = (x) => (property.log10 ? Format.scientific(x) : x.toFixed(2));
+    const text = property.log10 ? Format.scientific : Format.within(property);
     const ticks = [];
     if (property.log10) for (let p = Math.ceil(domain[0]); p <= domain[1]; p += domain[1] - domain[0] > 6 ? 2 : 1) ticks.push({ at: p, text: Format.power(p) });
     else {
@@ -197,7 +197,7 @@ const Sections = (() => {
     }
     return Charts.histogram({
       title: `${name}${unit && ` [${unit}]`}, before`,
-      sub: `${Format.count(all)} voxels, ${text(property.lo)} to ${text(property.hi)}${unit && ` ${unit}`}`,
+      sub: `${Format.count(all)} voxels, range ${text(property.lo)} to ${text(property.hi)}${unit && ` ${unit}`}`,
       edges, bins: parts, domain, ticks,
       marks: [
         { at: property.lo, text: text(property.lo), own: true },
@@ -230,7 +230,7 @@ const Sections = (() => {
       const all = row.classes.reduce((sum, count) => sum + count, 0);
       return {
         label: row.category || "(unknown)",
-        choose: () => filter.only("category", row.category),
+        choose: () => filter.only({ category: row.category, states: STORED }),
         parts: row.classes.flatMap((count, id) => (count ? [{ colour: colours[id], share: count / all, title: `${names[id]} ${Format.share(count / all)}` }] : [])),
         number: Format.plural(row.assets, "asset"),
       };
@@ -247,10 +247,9 @@ const Sections = (() => {
     const { stored: inStore, assets: total } = CONTENT.all;
     const notes = [];
     if (TOTAL < total) notes.push(`This page shows a sample: ${Format.count(TOTAL)} of ${Format.count(total)} assets are in its table and in its charts and medians; counts of assets by verdict and of ties, and of SLAT voxels, are of all.`);
-    if (side < 64) notes.push(`To keep this page small, 3D views show ${side}³ voxels: each stands for 2 × 2 × 2 of the store's.`);
+    notes.push(`3D views show the cells of a ${side}³ grid${side < 64 ? ", to keep this page small," : ""} and each value as one of ${CONTENT.detail.levels} steps of its range.`);
     if (assets < inStore) notes.push(`${Format.count(assets)} of ${Format.count(inStore)} assets have a thumbnail and a 3D view, and make up the distributions: those with a doubtful or failed alignment first, the rest evenly chosen.`);
     byId("detail-hint").textContent = notes.join(" ");
-    byId("detail-hint").hidden = !notes.length;
     byId("colophon").textContent = `Made by slatprep ${CONTENT.versions.slatprep} from build ${CONTENT.build_id.slice(0, 12)}${CONTENT.created ? ` of ${CONTENT.created}` : ""}.`;
     byId("parameters").replaceChildren(...CONTENT.parameters.map(([name, value]) => el("li", {}, el("code", {}, `${name} = ${value}`))));
   }

@@ -231,7 +231,7 @@ const Viewer = (() => {
     const { property } = MODES.find((one) => one.key === mode);
     const { symbol, unit } = PROPERTY_NAMES[mode];
     const value = Data.mapped(property, step);
-    return `${symbol} ${property.log10 ? Format.scientific(value) : value.toFixed(2)} ${unit}`.trim();
+    return `${symbol} ${property.log10 ? Format.scientific(value) : Format.within(property)(value)} ${unit}`.trim();
   }
 
   /** Say what is under the pointer. */
