@@ -168,8 +168,9 @@ def _selected(
     if run is not None:
         file, rule, filters = run
         how = f"as {file} says"
-    elif not splits.given:
-        how += ", as no run lies beside the predictions (others: --split-by, --split all)"
+    elif not splits.given and split != "all":
+        how += ", as no run lies beside the predictions" if predictions else ""
+        how += " (others: --split-by, --split all)"
     of_object = options.split_of_objects(output, store, rule, f"{split}, {how}")
     part = None if split == "all" else split
     without = set[int]()

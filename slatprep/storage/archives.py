@@ -256,6 +256,8 @@ def _extend(
         index.complete = True
     except ArchiveError as error:
         index.complete, index.fault = True, str(error)
+        if error.all_of_it:
+            index.members.clear()
     finally:
         if index.complete or not archive.packed:
             _write_index(archive, index)

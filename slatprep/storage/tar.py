@@ -13,7 +13,7 @@ import tarfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, Self
 
 
 class Ranges(Protocol):
@@ -167,6 +167,10 @@ BLOCK = tarfile.BLOCKSIZE
 MAX_KEPT = 2**27
 """Largest member [byte] that is kept; no reader takes a larger file."""
 
+_EXTENSIONS = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE,
+               tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK)  # fmt: skip
+"""Types of members that hold the name or other attributes of the next member."""
+
 _STREAMED = 2**23
 """Bytes per read of a gzip archive."""
 
@@ -187,8 +191,32 @@ class Entry(NamedTuple):
     link: str = ""
 
 
+class _Header(tarfile.TarInfo):
+    """A header that is refused if it is damaged, or claims a size that no header has.
+
+    tarfile would take a damaged header for the end, and read a name of any length.
+    """
+
+    @classmethod
+    def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
+        try:
+            header = super().frombuf(buf, encoding, errors)
+        except tarfile.HeaderError as error:
+            if any(buf):
+                raise tarfile.ReadError(str(error)) from None
+            raise
+        most = MAX_READ if header.type in _EXTENSIONS else 2**63
+        if not 0 <= header.size <= most:
+            raise tarfile.ReadError(f"a header claims {header.size:,} bytes")
+        return header
+
+
 class ArchiveError(Exception):
-    """An archive that is damaged from some byte on; its text says how."""
+    """An archive that is damaged from some byte on, or perhaps `all_of_it`; its text says how."""
+
+    def __init__(self, text: str, all_of_it: bool = False) -> None:
+        super().__init__(text)
+        self.all_of_it = all_of_it
 
 
 def entries(
@@ -203,7 +231,7 @@ def entries(
     leaps = Leaps(file)
     file.seek(begin)
     with _told():
-        archive = tarfile.TarFile(fileobj=file, mode="r", errors="surrogateescape")
+        archive = tarfile.TarFile(fileobj=file, mode="r", errors="surrogateescape", tarinfo=_Header)
     while True:
         with _told(f"is damaged at byte {archive.offset:,}"):
             member = archive.next()
@@ -232,8 +260,13 @@ def unpack(
     Each comes with the number of bytes read from the file. `keep` gets the data of members that
     are `wanted` and not larger than `MAX_KEPT`.
     """
-    stream = io.BufferedReader(file, _STREAMED)
-    with _told(), tarfile.open(fileobj=stream, mode="r|gz", errors="surrogateescape") as archive:
+    plain = gzip.GzipFile(fileobj=io.BufferedReader(file, _STREAMED))
+    with (
+        _told(),
+        tarfile.open(
+            fileobj=plain, mode="r|", bufsize=BLOCK, errors="surrogateescape", tarinfo=_Header
+        ) as archive,
+    ):
         for member in archive:
             entry = _entry(member, 0)
             archive.members.clear()  # type: ignore[attr-defined]
@@ -248,6 +281,16 @@ def unpack(
                     raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
                 keep(entry, content)
             yield entry, file.tell()
+        # Zeros follow the last member, and then comes the checksum of all.
+        last = b""
+        try:
+            while rest := plain.read(_STREAMED):
+                last = rest[-BLOCK:]
+        except gzip.BadGzipFile as error:
+            text = f"is damaged somewhere ({error}); {INCOMPLETE}"
+            raise ArchiveError(text, all_of_it=True) from None
+        if not last or any(last):
+            raise ArchiveError(f"has no end; {INCOMPLETE}")
 
 
 def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:
@@ -268,12 +311,15 @@ def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:
     return Entry(name, member.offset_data, member.size, check, problem, link)
 
 
+_DAMAGED = (tarfile.TarError, EOFError, ValueError, RecursionError, zlib.error, gzip.BadGzipFile)
+
+
 @contextmanager
 def _told(fault: str = "is no intact tar archive") -> Iterator[None]:
     """Turn errors of tarfile for damaged bytes into `ArchiveError`."""
     try:
         yield
-    except (tarfile.TarError, EOFError, ValueError, zlib.error, gzip.BadGzipFile) as error:
+    except _DAMAGED as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ArchiveError(f"{fault} ({reason}); {INCOMPLETE}") from None
 

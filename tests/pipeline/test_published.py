@@ -1,13 +1,17 @@
 """A store of PixieVerse as it is published is that of the unpacked folders."""
 
+import gzip
 import hashlib
+import io
+import re
 import shutil
 import tarfile
 import zlib
 from pathlib import Path
 
 import pytest
-from support.published import IDS, add, pack, parameters, write_object
+from support.memory import less_than
+from support.published import BLOCK, IDS, add, pack, parameters, write_object
 from support.synthetic import make_asset
 from support.trees import records_of, tree
 
@@ -214,6 +218,67 @@ def test_what_lies_before_a_break_is_built(objects, made, strange, tmp_path, suf
     else:
         assert "is damaged at byte" in line
     assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[0]]
+
+
+def header(size: int, kind: bytes = tarfile.REGTYPE) -> bytes:
+    """Return a header with any size, which tarfile would not write."""
+    block = bytearray(tarfile.TarInfo("x/y").tobuf(tarfile.GNU_FORMAT))
+    block[124:136], block[156:157] = tarfile.itn(size, 12, tarfile.GNU_FORMAT), kind
+    block[148:156] = b" " * 8
+    block[148:156] = b"%06o\0 " % sum(block)
+    return bytes(block)
+
+
+def other_bit(data: bytes) -> bytes:
+    """Change a value of the first grid in a gzip file that holds its data as they are."""
+    plain = gzip.decompress(data)
+    packed = bytearray(gzip.compress(plain, 0))
+    at = packed.index(b"\x93NUMPY", packed.index(b"material_grid.npy")) + 500_000
+    packed[at] ^= 64
+    return bytes(packed)
+
+
+COMMENT = header(30, tarfile.XHDTYPE) + b"30 comment=aaaaaaaaaaaaaaaaaa\n".ljust(BLOCK, b"\0")
+
+
+@pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
+@pytest.mark.parametrize(("behind", "said"), [
+    (header(-BLOCK), "a header claims -512 bytes"),
+    (3000 * COMMENT + header(0), "recursion"),
+    (header(2**30, tarfile.XHDTYPE) + bytes(2**24), "a header claims 1,073,741,824 bytes"),
+    (b"x" * BLOCK, "is damaged at byte|invalid header"),
+    (b"", "has no end"),
+], ids=["negative", "nested", "large", "no header", "cut"])  # fmt: skip
+def test_strange_headers_end_one_archive_alone(
+    objects, made, strange, tmp_path, suffix, behind, said
+):
+    whole, file = strange / "a.tar", strange / f"b{suffix}"
+    for number, path in enumerate((whole, strange / "b")):
+        pack(path, [objects / IDS[number]])
+    plain = strange.joinpath("b").read_bytes()
+    (strange / "b").unlink()
+    with tarfile.open(fileobj=io.BytesIO(plain)) as archive:
+        archive.getmembers()
+        plain = plain[: archive.offset] + behind + bytes(10 * BLOCK) * bool(behind)
+    file.write_bytes(gzip.compress(plain) if suffix == ".tar.gz" else plain)
+    with less_than(300e6):
+        summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
+    (line,) = [text for about, text in summary.problems if about.startswith("b.tar")]
+    assert re.search(said, line) and "download it again" in line
+    assert open_store(tmp_path / "s.zarr").ids == [IDS[0], IDS[1]]
+
+
+def test_nothing_is_taken_from_a_gzip_archive_whose_checksum_is_wrong(
+    objects, made, strange, tmp_path
+):
+    pack(strange / "a.tar", [objects / IDS[0]])
+    path = strange / "b.tar.gz"
+    pack(path, [objects / IDS[1]])
+    path.write_bytes(other_bit(path.read_bytes()))
+    summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
+    (line,) = [text for about, text in summary.problems if about == path.name]
+    assert "is damaged somewhere (CRC check failed" in line and "download it again" in line
+    assert open_store(tmp_path / "s.zarr").ids == [IDS[0]]
 
 
 def test_archive_replaced_during_a_build_is_noticed(objects, strange):
