@@ -127,13 +127,18 @@ def _shape_text(shape: tuple[int | range | None, ...], most: int = 0) -> str:
     return f"({text},)" if len(shape) == 1 else f"({text})"
 
 
+NO_SLAT = "no SLAT for id"
+"""Words in the problem of a pair whose SLAT is missing; else its grid has a problem."""
+
+
 def require_complete(pair: AssetPair) -> tuple[Place, Place]:
     """Return the paths of grid and SLAT.
 
     Raises MissingPartnerError if a side is missing, and InputError if the pair has another problem.
     """
     if pair.grid is None or pair.slat is None:
-        root = pair.roots.pixieverse if pair.grid is None else pair.roots.slat
+        of_slat = pair.grid is not None and NO_SLAT in (pair.problem or NO_SLAT)
+        root = pair.roots.slat if of_slat else pair.roots.pixieverse
         fault = pair.problem or f"nothing for id {pair.asset_id!r}"
         raise MissingPartnerError(root, fault, "a grid and a SLAT per id")
     if pair.problem:

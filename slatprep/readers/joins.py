@@ -13,6 +13,7 @@ from typing import TextIO
 
 from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters
+from slatprep.readers.files import NO_SLAT
 from slatprep.records import MAX_NAME_BYTES, AssetPair, Place
 from slatprep.storage.documents import read_bounded, unique
 from slatprep.storage.place import storage_of
@@ -115,7 +116,8 @@ def explain_unmatched(pairs: Collection[AssetPair], parameters: BuildParameters)
 
     `pairs` is what `discover` returned for `parameters`.
     """
-    grids = [pair.object_id for pair in pairs if pair.slat is None and pair.grid is not None]
+    alone = [pair for pair in pairs if pair.slat is None and pair.grid is not None]
+    grids = [pair.object_id for pair in alone if NO_SLAT in pair.problem]
     slats = [pair.object_id for pair in pairs if pair.grid is None and pair.slat is not None]
     if not grids or not slats or any(pair.grid and pair.slat for pair in pairs):
         return ""

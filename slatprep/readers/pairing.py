@@ -15,6 +15,7 @@ from slatprep.errors import ConfigError, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import adapters
 from slatprep.readers.contents import contents_of
+from slatprep.readers.files import NO_SLAT
 from slatprep.readers.joins import by_case, read_categories, read_map
 from slatprep.readers.patterns import NAME, fill, find_files, list_below, tried_names
 from slatprep.readers.published import category_of, hint_of, locate_grids
@@ -107,7 +108,16 @@ def discover(
     grids, slats = each[0], find_slats(slat, folder != slat.root)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
-    rows = list(_rows(grids, slats, claims, each_sample=pixieverse.samples == "all"))
+    damaged = dict[str, list[adapters.FoundField]]()
+    for source, others in zip(parameters.also, each[1:], strict=True):
+        unusable = dict.fromkeys(name for name, found in others.items() if found[0].problem)
+        if not unusable and others.keys().isdisjoint(grids):
+            raise ConfigError(
+                f"{source.root}: has none of the objects that [pixieverse] has; expected ids such "
+                f"as {min(grids)!r}, found {min(others)!r}"
+            )
+        damaged |= {name: [] for name in unusable}
+    rows = list(_rows(damaged | grids, slats, claims, each_sample=pixieverse.samples == "all"))
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     contents, cases = contents_of(parameters), by_case(grids, slats)
     found = []
@@ -199,7 +209,9 @@ def _pairs(rows: list[_Row], found: Sequence[_Found]) -> Iterator[AssetPair]:
 
 def _pair(row: _Row, found: Sequence[_Found], shared: str) -> AssetPair:
     samples = found[0].source.samples
-    annotations = _annotations(row, found[0])
+    # A further source alone has what is damaged there, such as an archive.
+    there = next((one for one in found if row.object_id in one.grids), found[0])
+    annotations = _annotations(row, there)
     if samples == "merge" and annotations:
         first, *others = [
             _pair_of(row, source, shared, grids)
@@ -208,7 +220,7 @@ def _pair(row: _Row, found: Sequence[_Found], shared: str) -> AssetPair:
         ]
         return replace(first, others=tuple(others))
     chosen = annotations[:1] if samples == "first" else annotations
-    return _pair_of(row, found[0], shared, list(chain.from_iterable(chosen)))
+    return _pair_of(row, there, shared, list(chain.from_iterable(chosen)))
 
 
 def _annotations(row: _Row, there: _Found) -> list[list[adapters.FoundField]]:
@@ -255,10 +267,10 @@ def _pair_of(
                     tried = fill(source.transform, known)
                     problems.append(f"no transform for id {row.object_id!r}{LOOKED_FOR}{tried}")
     else:
-        problems += _lacking(row, there, "grid", _tried_grids(source, {"id": "{id}"}))
+        problems += _lacking(row, there, "no grid for id", _tried_grids(source, {"id": "{id}"}))
     found = [slat for slat in row.slats if slat.path]
     if not found and not any(grid.problem for grid in grids):
-        problems += _lacking(row, there, "SLAT", _tried_slats(row, there))
+        problems += _lacking(row, there, NO_SLAT, _tried_slats(row, there))
     elif len(found) > 1:
         files = ", ".join(slat.path + (f" [{slat.group}]" if slat.group else "") for slat in found)
         problems.append(
@@ -286,11 +298,11 @@ def _pair_of(
     )
 
 
-def _lacking(row: _Row, there: _Found, side: str, tried: str) -> Iterator[str]:
+def _lacking(row: _Row, there: _Found, what: str, tried: str) -> Iterator[str]:
     """Say that a side is missing, and whether it has the id in another letter case."""
-    yield f"no {side} for id {row.object_id!r}{LOOKED_FOR}{tried}"
+    yield f"{what} {row.object_id!r}{LOOKED_FOR}{tried}"
     if other := there.cases.get(row.object_id):
-        yield f"a {side} is called {other!r}: rename one, or join them with --map"
+        yield f"a {what.split()[1]} is called {other!r}: rename one, or join them with --map"
 
 
 def _name_problems(row: _Row, files: Sequence[str]) -> Iterator[str]:

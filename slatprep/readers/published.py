@@ -54,6 +54,10 @@ def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = 
             files, folders = storage_of(root).names()
             archives = sorted(name for name in files if is_archive(name))
             if archives:
+                beside = sorted([*folders, *(name for name in files if ".tar." in name)])
+                if note and (beside := [name for name in beside if name not in archives]):
+                    more = f" and {len(beside) - 1:,} more" if len(beside) > 1 else ""
+                    note(f"{root}: its archives are read, but not {beside[0]}{more} beside them")
                 return _tree(root, archives, wanted, str(root), note)
             inner = next((name for name in (GRIDS, ARCHIVES) if name in folders), "")
             if not inner:
@@ -83,12 +87,12 @@ def fetch_members(pairs: Iterable[AssetPair], note: Callable[[str], None] | None
 
 def _telling(what: str, note: Callable[[str], None] | None) -> Callable[[int, int], None]:
     """Return a function that takes the bytes done and all bytes, and notes them now and then."""
-    told = time.monotonic()
+    told, last = time.monotonic(), 0
 
     def tell(done: int, total: int) -> None:
-        nonlocal told
-        if note and (time.monotonic() - told > _EVERY_S or done == total):
-            told = time.monotonic()
+        nonlocal told, last
+        if note and done > last and (time.monotonic() - told > _EVERY_S or done == total):
+            told, last = time.monotonic(), done
             note(f"{what} {done / 1e6:,.0f} of {total / 1e6:,.0f} MB")
 
     return tell

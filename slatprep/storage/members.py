@@ -160,7 +160,7 @@ class ArchivePlace(PlaceByText):
 
 
 class MemberListing(RemoteListing):
-    """Names in archives; a damaged archive looks like a folder that cannot be listed."""
+    """Names in archives; a damaged one looks like a folder anywhere that cannot be listed."""
 
     def __init__(self, files: Iterable[str], faults: dict[str, str]) -> None:
         super().__init__(files)
@@ -168,10 +168,11 @@ class MemberListing(RemoteListing):
 
     def of_folder(self, folder: str, *, folders: bool) -> Iterable[str]:
         """See `slatprep.storage.files.Listing`."""
-        if fault := self._faults.get(folder.rstrip("/")):
-            raise OSError(errno.EIO, fault, folder.rstrip("/"))
+        name = folder.rstrip("/").rpartition("/")[2]
+        if fault := self._faults.get(name):
+            raise OSError(errno.EIO, fault, name)
         found = list(super().of_folder(folder, folders=folders))
-        return [*found, *self._faults] if folders and not folder else found
+        return [*found, *self._faults] if folders else found
 
 
 _GAP, _MOST = 2**18, 2**24

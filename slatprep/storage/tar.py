@@ -272,8 +272,13 @@ def unpack(
             archive.members.clear()  # type: ignore[attr-defined]
             if entry is None:
                 continue
+            if not entry.problem and not entry.link and not wanted(entry.name):
+                # Only a link to it is ever asked for.
+                entry = entry._replace(
+                    problem=f"shares the data of {entry.name}, which is not kept"
+                )
             small = member.isreg() and member.size <= MAX_KEPT
-            if small and not entry.problem and wanted(entry.name):
+            if small and not entry.problem:
                 data = archive.extractfile(member)
                 assert data is not None
                 content = data.read()

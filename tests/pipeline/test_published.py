@@ -7,6 +7,7 @@ import re
 import shutil
 import tarfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from support.published import BLOCK, IDS, add, pack, parameters, write_object
 from support.synthetic import make_asset
 from support.trees import records_of, tree
 
-from slatprep import InputError, build_store, discover, open_store, read_field
+from slatprep import InputError, StoreError, build_store, discover, open_store, read_field
 from slatprep.inspect.verify import verify_store
 from slatprep.storage.archives import Archive
 from slatprep.storage.files import LocalFile
@@ -279,6 +280,70 @@ def test_nothing_is_taken_from_a_gzip_archive_whose_checksum_is_wrong(
     (line,) = [text for about, text in summary.problems if about == path.name]
     assert "is damaged somewhere (CRC check failed" in line and "download it again" in line
     assert open_store(tmp_path / "s.zarr").ids == [IDS[0]]
+
+
+def test_an_archive_that_is_none_is_named_where_it_lies(objects, made, strange, tmp_path):
+    (strange / "page.tar").write_bytes(b"<html>" * 1000)
+    for sound in (False, True):
+        if sound:
+            pack(strange / "a.tar", [objects / IDS[0]])
+            told = dict(build_store(parameters(made, strange), tmp_path / "s.zarr").problems)
+            said = f"{told['page.tar']}\n"
+        else:
+            with pytest.raises(StoreError) as raised:
+                build_store(parameters(made, strange), tmp_path / "s.zarr")
+            said = str(raised.value)
+        assert f"{strange}: page.tar: cannot be listed (is no intact tar archive" in said
+        assert "no id occurs on both sides" not in said
+
+
+def test_a_damaged_archive_is_named_whatever_the_pattern(objects, made, strange, tmp_path):
+    path = strange / "tree.tar"
+    with tarfile.open(path, "w") as archive:
+        for number in range(2):
+            archive.add(objects / IDS[number], arcname=f"below/{IDS[number]}")
+    path.write_bytes(truncated(path.read_bytes()))
+    whole = parameters(made, strange)
+    patterns = ("below/{id}/sample_{sample}/material_grid.npy",)
+    source = replace(whole.pixieverse, grid=patterns)
+    summary = build_store(replace(whole, pixieverse=source), tmp_path / "s.zarr")
+    assert [about for about, _ in summary.problems if about == "tree.tar"] == ["tree.tar"]
+    assert open_store(tmp_path / "s.zarr").ids == [IDS[0]]
+
+
+def test_what_lies_beside_archives_and_is_not_read_is_told(objects, made, strange):
+    pack(strange / "a.tar", [objects / IDS[0]])
+    told: list[str] = []
+    discover(parameters(made, strange), told.append)
+    assert not [text for text in told if "beside" in text]
+    (strange / IDS[1]).mkdir()
+    (strange / "b.tar.xz").touch()
+    discover(parameters(made, strange), told.append)
+    said = f"{strange}: its archives are read, but not {IDS[1]} and 1 more beside them"
+    assert [text for text in told if "beside" in text] == [said]
+
+
+@pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
+def test_a_link_to_a_file_that_no_pattern_names(objects, made, strange, tmp_path, suffix):
+    path = strange / f"tree{suffix}"
+    grid = grid_of(objects, 0)
+    with tarfile.open(path, "w:gz" if suffix == ".tar.gz" else "w") as archive:
+        add(archive, f"{IDS[0]}/other.npy", grid.read_bytes())
+        link = tarfile.TarInfo(f"{IDS[0]}/sample_0/material_grid.npy")
+        link.type, link.linkname = tarfile.LNKTYPE, f"{IDS[0]}/other.npy"
+        archive.addfile(link)
+    (pair,) = [one for one in discover(parameters(made, strange)) if one.grid]
+    if suffix == ".tar":
+        assert len(read_field(pair).voxels)
+    else:
+        with pytest.raises(InputError, match=r"shares the data of .*other\.npy, which is not kept"):
+            read_field(pair)
+
+
+def test_progress_through_archives_is_told_once_at_the_end(made):
+    told: list[str] = []
+    discover(parameters(made, made / "gz"), told.append)
+    assert len(told) == len({*told})
 
 
 def test_archive_replaced_during_a_build_is_noticed(objects, strange):

@@ -234,6 +234,19 @@ def test_each_sample_may_be_an_asset(several, tmp_path):
     assert not store.merges
 
 
+def test_a_further_source_without_use_is_named(own, tmp_path):
+    third = own.root / "third"
+    third.rename(own.root / "away")
+    third.mkdir()
+    (third / "torn.tar").write_bytes(b"<html>" * 1000)
+    problems = dict(build_store(asked(own), tmp_path / "s.zarr").problems)
+    assert f"{third}: torn.tar: cannot be listed (is no intact tar archive" in problems["torn.tar"]
+    (third / "torn.tar").unlink()
+    (own.root / "away" / "b").rename(third / "x")
+    with pytest.raises(ConfigError, match=r"third: has none of the objects .* 'a', found 'x'"):
+        build_store(asked(own), tmp_path / "s.zarr")
+
+
 def test_what_fails_is_left_out_and_named_and_an_asset_fails_when_none_is_left(own, tmp_path):
     for name in "ab":
         path = own.root / f"pixieverse/{name}/sample_0/material_grid.npy"
