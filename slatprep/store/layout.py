@@ -147,7 +147,8 @@ ARRAYS = (
     _voxel("place", "exponents", "float32",
         "where it was looked up, in the PixieVerse frame's unit cube [-0.5, 0.5]^3", "axis"),
     _voxel("confidence", "exponents", "float32",
-        "calibrated probability that the class is right, 0 where not valid"),
+        "calibrated probability that the class is right (without classes: the properties), "
+        "0 where not valid"),
     ArrayLayout("grid/properties", "float32", ("asset", "property", *_XYZ), NAN,
         "normalised PixieVerse field in [-1, 1], NaN where not annotated"),
     ArrayLayout("grid/material", "uint8", ("asset", *_XYZ), BACKGROUND,

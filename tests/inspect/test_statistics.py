@@ -201,9 +201,10 @@ def axes_of(picture: bytes) -> set[str]:
     return {one for one in told if one.endswith(("]", "ratio"))}
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_picture_is_the_same_each_time_and_takes_any_name_and_unit(store, tmp_path):
     copy = Path(shutil.copytree(store, tmp_path / "s.zarr"))
-    names = np.array(["$\\frac", "$$", "b", "x" * 60, "b"], dtype=object)
+    names = np.array(["$\\frac", "$$", "中\n\x07", "x" * 60, "b"], dtype=object)
     rewrite(copy, "asset/category", slice(None), names)
     opened = open_store(copy)
     found = statistics.store_statistics(opened)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from io import BytesIO
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep.errors import printable
 from slatprep.records import INK as INK
 from slatprep.records import MUTED as MUTED
 from slatprep.records import PICTURE_FORMATS, SVG_SALT
@@ -65,7 +67,10 @@ def styled() -> AbstractContextManager[None]:
 def in_format(figure: Figure, kind: str = "png") -> bytes:
     """Return a figure as the bytes of a file in one of `PICTURE_FORMATS`."""
     buffer = BytesIO()
-    figure.savefig(buffer, format=kind, dpi=figure.dpi, metadata=PICTURE_FORMATS[kind])
+    with warnings.catch_warnings():
+        # A name may have letters that the font lacks; a box stands for each.
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)
+        figure.savefig(buffer, format=kind, dpi=figure.dpi, metadata=PICTURE_FORMATS[kind])
     return buffer.getvalue()
 
 
@@ -125,7 +130,8 @@ def draw_line(figure: Figure, x: float, y: float, end: tuple[float, float], colo
 
 
 def cut(words: str, most: int) -> str:
-    """Return words cut to `most` characters."""
+    """Return words on one line, cut to `most` characters."""
+    words = printable(" ".join(words.split()))
     return words if len(words) <= most else f"{words[: most - 1]}…"
 
 
