@@ -439,6 +439,7 @@ def test_side_by_side_on_the_same_objects(case, tmp_path):
     command = ("evaluate", ours, "--store", case.store, "--split", "all", "--grids",
                f"Pixie={case.results}", "--grids", four)  # fmt: skip
     done = run(*command, "--csv", table, "--picture", picture, "--beside", "slat-phys")
+    assert "as no run lies" not in done.stderr  # All objects are asked for.
     names = [OURS, "Pixie, SLAT voxels", "Pixie, own grid", "four, SLAT voxels", "four, own grid"]
     lines = table.read_text().splitlines()
     assert lines[0].split(",")[:3] == ["method", "objects", "log10 E"]
