@@ -264,7 +264,7 @@ def unpack(
     with (
         _told(),
         tarfile.open(
-            fileobj=plain, mode="r|", bufsize=BLOCK, errors="surrogateescape", tarinfo=_Header
+            fileobj=plain, mode="r|", bufsize=2**16, errors="surrogateescape", tarinfo=_Header
         ) as archive,
     ):
         for member in archive:
@@ -286,14 +286,11 @@ def unpack(
                     raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
                 keep(entry, content)
             yield entry, file.tell()
+        assert archive.fileobj is not None
         # Zeros follow the last member, and then comes the checksum of all.
         last = b""
-        try:
-            while rest := plain.read(_STREAMED):
-                last = rest[-BLOCK:]
-        except gzip.BadGzipFile as error:
-            text = f"is damaged somewhere ({error}); {INCOMPLETE}"
-            raise ArchiveError(text, all_of_it=True) from None
+        while rest := archive.fileobj.read(_STREAMED):
+            last = rest[-BLOCK:]
         if not last or any(last):
             raise ArchiveError(f"has no end; {INCOMPLETE}")
 
@@ -326,7 +323,9 @@ def _told(fault: str = "is no intact tar archive") -> Iterator[None]:
         yield
     except _DAMAGED as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ArchiveError(f"{fault} ({reason}); {INCOMPLETE}") from None
+        # A wrong checksum does not say where the damage is.
+        anywhere = isinstance(error, gzip.BadGzipFile)
+        raise ArchiveError(f"{fault} ({reason}); {INCOMPLETE}", all_of_it=anywhere) from None
 
 
 def plain_name(name: str) -> str:

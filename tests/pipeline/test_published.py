@@ -278,7 +278,7 @@ def test_nothing_is_taken_from_a_gzip_archive_whose_checksum_is_wrong(
     path.write_bytes(other_bit(path.read_bytes()))
     summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
     (line,) = [text for about, text in summary.problems if about == path.name]
-    assert "is damaged somewhere (CRC check failed" in line and "download it again" in line
+    assert "is no intact tar archive (CRC check failed" in line and "download it again" in line
     assert open_store(tmp_path / "s.zarr").ids == [IDS[0]]
 
 
