@@ -150,13 +150,12 @@ def _checked(field: MaterialField) -> MaterialField:
     ):
         if values.shape != shape:
             raise ValueError(f"field.{name} has shape {values.shape}; expected {shape}")
-    classes = material.astype(np.uint8)
-    if not ((classes == material) & (classes < UNANNOTATED)).all():
+    if not ((material >= 0) & (material < UNANNOTATED) & (material == np.floor(material))).all():
         raise ValueError(
             f"field.material has values that are no classes; expected 0 to {UNANNOTATED - 1}"
         )
     properties = properties.astype(np.float32)
-    return replace(field, voxels=voxels, material=classes, properties=properties)
+    return replace(field, voxels=voxels, material=material.astype(np.uint8), properties=properties)
 
 
 def _voxels(voxels: ArrayLike, name: str, side: int = RESOLUTION) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import unicodedata
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
@@ -51,6 +52,15 @@ def apart_from(name: str, others: Collection[str]) -> str:
     ('cup', '"all"')
     """
     return f'"{name}"' if name in others else name
+
+
+UNKNOWN = "(unknown)"
+"""Name of the row of assets without a category."""
+
+
+def row_of_category(name: str) -> str:
+    """Return the name of a category's row in a table that also has a row for all assets."""
+    return apart_from(name, (UNKNOWN, "all")) or UNKNOWN
 
 
 def amount(count: int, noun: str) -> str:
@@ -109,7 +119,8 @@ class InputError(SlatprepError):
 
         A dataset may move, while its records stay.
         """
-        return " ".join(str(self).replace(f"{in_unicode(str(root))}/", "").split())
+        path = rf"(?<![^\s'\"(]){re.escape(in_unicode(str(root)))}/"
+        return " ".join(re.sub(path, "", str(self)).split())
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         # Pickle needs this to send an exception with its own signature from a worker

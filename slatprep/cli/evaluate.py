@@ -74,7 +74,7 @@ def evaluate(
     slatprep evaluate runs/large/predictions --store pixieverse.zarr --beside pixie
     slatprep evaluate predictions --store data/demo.zarr --grids Pixie=results --picture m.png
     """
-    from slatprep.inspect.overview import UNKNOWN
+    from slatprep.errors import UNKNOWN
     from slatprep.learn.evaluate import draw_comparison, evaluate_store, require_pixieverse
     from slatprep.learn.metrics import OURS, SPREADS, metrics_of
     from slatprep.learn.predictions import predictions_of

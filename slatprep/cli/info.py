@@ -73,18 +73,17 @@ def show_quality(
     `store` is the place as it was typed, because an object store deletes a version two builds
     later.
     """
-    from slatprep.inspect.overview import UNKNOWN
+    from slatprep.errors import UNKNOWN
     from slatprep.judge import THRESHOLDS
 
     figures = ("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
-    categories = [(apart_from(one.name, (total.name,)), one) for one in overview.categories]
     output.table(
         "Alignments (medians)",
         ("category", *total.verdicts, *figures),
         [
-            (name, *group.verdicts.values(), *attrgetter(*figures)(group))
-            for name, group in (*categories, (total.name, total))
+            (group.name, *group.verdicts.values(), *attrgetter(*figures)(group))
+            for group in (*overview.categories, total)
         ],
     )
     unknown = sum(group.assets for group in overview.categories if group.name == UNKNOWN)

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError, apart_from, printable
+from slatprep.errors import ConfigError, StoreError, printable, row_of_category
 from slatprep.export import croissant, export_store, target
 from slatprep.export.croissant import Stated
 from slatprep.records import USABLE, Place, Verdict
@@ -202,9 +202,7 @@ def _table(store: Store, kept: NDArray[np.bool_]) -> Iterator[str]:
     yield "| --- |" + " ---: |" * 8
     names = sorted(set(map(str, columns["category"])))
     for name in names:
-        yield _row(
-            _plain(apart_from(name, ("all",))) or "(unknown)", columns, columns["category"] == name
-        )
+        yield _row(_plain(row_of_category(name)), columns, columns["category"] == name)
     if len(names) > 1:
         yield _row("all", columns, np.ones(kept.sum(), dtype=bool))
 

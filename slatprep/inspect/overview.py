@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import apart_from
+from slatprep.errors import row_of_category
 from slatprep.judge import THRESHOLDS
 from slatprep.records import Normalization, Place, Verdict
 from slatprep.storage.place import storage_of
@@ -18,7 +18,6 @@ from slatprep.store import Store
 from slatprep.store.reader import open_again
 from slatprep.store.records import StoredRecords
 
-UNKNOWN = "(unknown)"
 """Name of the group of assets whose category is unknown."""
 
 _MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
@@ -94,8 +93,7 @@ def overview_of(store: Store) -> StoreOverview:
         normalization=store.normalization,
         total=_group("all", columns, list(range(len(store)))),
         categories=tuple(
-            _group(apart_from(name, (UNKNOWN, "all")) or UNKNOWN, columns, own)
-            for name, own in sorted(rows.items())
+            _group(row_of_category(name), columns, own) for name, own in sorted(rows.items())
         ),
     )
 

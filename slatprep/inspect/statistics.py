@@ -11,8 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import apart_from, require_one_of
-from slatprep.inspect.overview import UNKNOWN
+from slatprep.errors import require_one_of, row_of_category
 from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Place, Verdict
@@ -228,7 +227,7 @@ def store_statistics(
             if progress:
                 progress(done, len(rows))
         total += here
-        name = apart_from(category, (UNKNOWN, "all")) or UNKNOWN
+        name = row_of_category(category)
         groups.append(_group(store, "category", name, here, verdicts_here))
     everything = _group(store, "all", "all", total, Counter(verdict_of[row] for row in rows))
     classes = [_group(store, "class", name, total, None, k) for k, name in enumerate(labels)]

@@ -234,7 +234,7 @@ def collate(items: Sequence[Item]) -> SparseBatch:
 class EpochSampler(Sampler[Draw]):
     """Each of `length` assets once, in an order that follows from seed and epoch.
 
-    Each pass ends an epoch. Without `shuffle` the order is that of the store.
+    Each pass that begins is the next epoch. Without `shuffle` the order is that of the store.
     """
 
     def __init__(self, length: int, *, shuffle: bool, seed: int) -> None:

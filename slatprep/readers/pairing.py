@@ -109,9 +109,10 @@ def discover(
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
     damaged = dict[str, list[adapters.FoundField]]()
+    sound = not any(found[0].problem for found in grids.values())
     for source, others in zip(parameters.also, each[1:], strict=True):
         unusable = dict.fromkeys(name for name, found in others.items() if found[0].problem)
-        if not unusable and others.keys().isdisjoint(grids):
+        if sound and not unusable and others.keys().isdisjoint(grids):
             raise ConfigError(
                 f"{source.root}: has none of the objects that [pixieverse] has; expected ids such "
                 f"as {min(grids)!r}, found {min(others)!r}"
@@ -209,8 +210,11 @@ def _pairs(rows: list[_Row], found: Sequence[_Found]) -> Iterator[AssetPair]:
 
 def _pair(row: _Row, found: Sequence[_Found], shared: str) -> AssetPair:
     samples = found[0].source.samples
-    # A further source alone has what is damaged there, such as an archive.
-    there = next((one for one in found if row.object_id in one.grids), found[0])
+    there = found[0]
+    if row.object_id not in there.grids:
+        # What is damaged in a further source, such as an archive, may be there alone.
+        told = (one for one in found for grid in one.grids.get(row.object_id, ()) if grid.problem)
+        there = next(told, there)
     annotations = _annotations(row, there)
     if samples == "merge" and annotations:
         first, *others = [
@@ -248,7 +252,7 @@ def _pair_of(
     beside: tuple[Place, ...] = ()
     if grids:
         grid = there.roots.pixieverse / grids[0].path
-        if len(grids) > 1:
+        if len(grids) > 1 and not grids[0].problem:
             problems.append(adapters.several_grids(row.object_id, grids))
         if NAME.fullmatch(row.object_id):
             sample = grids[0].sample or source.sample

@@ -22,6 +22,9 @@ from slatprep.storage.place import storage_of
 
 GRIDS, ARCHIVES = "render_outputs", "archives"
 
+_PACKED = (".tar.xz", ".tar.bz2", ".tar.zst", ".txz", ".tbz2", ".zip", ".7z", ".rar")
+"""Ends of the names of archives that slatprep does not read."""
+
 _EVERY_S = 10.0
 """Seconds between two lines about progress."""
 
@@ -54,8 +57,9 @@ def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = 
             files, folders = storage_of(root).names()
             archives = sorted(name for name in files if is_archive(name))
             if archives:
-                beside = sorted([*folders, *(name for name in files if ".tar." in name)])
-                if note and (beside := [name for name in beside if name not in archives]):
+                packed = (name for name in files if name.lower().endswith(_PACKED))
+                beside = sorted(n for n in (*folders, *packed) if not n.startswith("."))
+                if note and beside:
                     more = f" and {len(beside) - 1:,} more" if len(beside) > 1 else ""
                     note(f"{root}: its archives are read, but not {beside[0]}{more} beside them")
                 return _tree(root, archives, wanted, str(root), note)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".tar", ".tar.gz", ".tgz")
 """Endings of the names of archives."""
 
-_FORMAT, _INDEX = 3, "index.z"
+_FORMAT, _INDEX = 4, "index.z"
 
 _COMMIT = re.compile(r"(?<=[^/])@[0-9a-f]{40}(?=/|$)")
 _SAVE_S = 20.0

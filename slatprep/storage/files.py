@@ -50,6 +50,11 @@ class LocalFile(FileIO):
         """Read up to `length` bytes from an offset."""
         return os.pread(self.fileno(), length, offset)
 
+    def upto(self, limit: int) -> bytes:
+        """Read at most `limit` + 1 bytes; the last one shows that the file is too large."""
+        # read() would allocate all that it is allowed to return.
+        return self.pread(min(self.size(), limit + 1), 0)
+
 
 class LocalFolder:
     """An open directory: files read below it belong to one store, even if the store is replaced.
@@ -73,8 +78,7 @@ class LocalFolder:
     def read(self, name: str, limit: int) -> bytes:
         """Read at most `limit` + 1 bytes of a file; the last byte shows that it is too large."""
         with self.open(name) as file:
-            # read() would allocate all that it is allowed to return.
-            return file.pread(min(file.size(), limit + 1), 0)
+            return file.upto(limit)
 
     def _open_at(self, name: str, flags: int) -> int:
         return os.open(name, flags | _NO_WAITING, dir_fd=self._descriptor)

@@ -196,8 +196,7 @@ class Storage:
         The file's state is noted under `asked`, or its own place; see `slatprep.storage.states`.
         """
         with open_regular(self._path) as file, reading(file.fileno(), str(asked or self._path)):
-            # read() would allocate all that it is allowed to return.
-            return file.pread(min(file.size(), limit + 1), 0)
+            return file.upto(limit)
 
     def open_scattered(self) -> IO[bytes]:
         """Open a file for random access; an object is fetched whole, at once. OSError as `open`."""

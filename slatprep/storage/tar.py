@@ -12,7 +12,7 @@ import io
 import tarfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NamedTuple, Protocol, Self
 
 
@@ -238,6 +238,7 @@ def entries(
         if member is None:
             break
         archive.members.clear()  # type: ignore[attr-defined]
+        _require_size(member)
         if member.offset_data + member.size > size and member.isreg():
             raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
         check = zlib.crc32(file.held(BLOCK, member.offset_data - BLOCK))
@@ -260,39 +261,63 @@ def unpack(
     Each comes with the number of bytes read from the file. `keep` gets the data of members that
     are `wanted` and not larger than `MAX_KEPT`.
     """
-    plain = gzip.GzipFile(fileobj=io.BufferedReader(file, _STREAMED))
-    with (
-        _told(),
-        tarfile.open(
-            fileobj=plain, mode="r|", bufsize=2**16, errors="surrogateescape", tarinfo=_Header
-        ) as archive,
-    ):
-        for member in archive:
-            entry = _entry(member, 0)
-            archive.members.clear()  # type: ignore[attr-defined]
-            if entry is None:
-                continue
-            if not entry.problem and not entry.link and not wanted(entry.name):
-                # Only a link to it is ever asked for.
-                entry = entry._replace(
-                    problem=f"shares the data of {entry.name}, which is not kept"
-                )
-            small = member.isreg() and member.size <= MAX_KEPT
-            if small and not entry.problem:
-                data = archive.extractfile(member)
-                assert data is not None
-                content = data.read()
-                if len(content) != member.size:
-                    raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
-                keep(entry, content)
-            yield entry, file.tell()
-        assert archive.fileobj is not None
-        # Zeros follow the last member, and then comes the checksum of all.
-        last = b""
-        while rest := archive.fileobj.read(_STREAMED):
-            last = rest[-BLOCK:]
-        if not last or any(last):
-            raise ArchiveError(f"has no end; {INCOMPLETE}")
+    plain = _Unpacked(fileobj=io.BufferedReader(file, _STREAMED))
+    try:
+        with (
+            _told(),
+            tarfile.open(
+                fileobj=plain, mode="r|", bufsize=2**16, errors="surrogateescape", tarinfo=_Header
+            ) as archive,
+        ):
+            for member in archive:
+                _require_size(member)
+                entry = _entry(member, 0)
+                archive.members.clear()  # type: ignore[attr-defined]
+                if entry is None:
+                    continue
+                if not entry.problem and not entry.link and not wanted(entry.name):
+                    # Only a link to it is ever asked for.
+                    problem = f"shares the data of {entry.name}, which is not kept"
+                    entry = entry._replace(problem=problem)
+                if member.isreg() and member.size <= MAX_KEPT and not entry.problem:
+                    data = archive.extractfile(member)
+                    assert data is not None
+                    keep(entry, data.read())
+                yield entry, file.tell()
+            plain.check()
+    except ArchiveError as error:
+        if not error.all_of_it:
+            with _told():
+                plain.check()
+        raise
+
+
+class _Unpacked(gzip.GzipFile):
+    """The content of a gzip file. A tar archive says where it ends, so no read goes beyond."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = b""
+        try:
+            data = self.read1(-1 if size is None else size)
+        except gzip.BadGzipFile as error:
+            # Other programs also ignore bytes behind the last part.
+            if not (self.tell() and str(error).startswith("Not a gzipped file")):
+                raise
+        if not data:
+            raise EOFError("it has no end")
+        return data
+
+    def check(self) -> None:
+        """Read the rest and its checksum; errors of gzip and zlib if the content is damaged."""
+        with suppress(EOFError):
+            while self.read(_STREAMED):
+                pass
+
+
+def _require_size(member: tarfile.TarInfo) -> None:
+    """Raise ArchiveError if a member has a negative size, which a header before it may claim."""
+    if member.size < 0:
+        raise ArchiveError(f"has a header that claims {member.size:,} bytes; {INCOMPLETE}")
 
 
 def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:
@@ -323,8 +348,8 @@ def _told(fault: str = "is no intact tar archive") -> Iterator[None]:
         yield
     except _DAMAGED as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        # A wrong checksum does not say where the damage is.
-        anywhere = isinstance(error, gzip.BadGzipFile)
+        # A wrong checksum does not say where the damage is, and a stream fails behind it.
+        anywhere = isinstance(error, gzip.BadGzipFile | zlib.error)
         raise ArchiveError(f"{fault} ({reason}); {INCOMPLETE}", all_of_it=anywhere) from None
 
 

@@ -10,6 +10,7 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.memory import less_than
 from support.published import BLOCK, IDS, add, pack, parameters, write_object
@@ -239,17 +240,20 @@ def other_bit(data: bytes) -> bytes:
     return bytes(packed)
 
 
+PAX_SIZE = header(12, tarfile.XHDTYPE) + b"12 size=-99\n".ljust(BLOCK, b"\0")
 COMMENT = header(30, tarfile.XHDTYPE) + b"30 comment=aaaaaaaaaaaaaaaaaa\n".ljust(BLOCK, b"\0")
 
 
 @pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
 @pytest.mark.parametrize(("behind", "said"), [
     (header(-BLOCK), "a header claims -512 bytes"),
+    (header(2**62), "ends within 'x/y'|has no end"),
+    (PAX_SIZE + header(0), "a header that claims -99 bytes|no intact"),
     (3000 * COMMENT + header(0), "recursion"),
     (header(2**30, tarfile.XHDTYPE) + bytes(2**24), "a header claims 1,073,741,824 bytes"),
     (b"x" * BLOCK, "is damaged at byte|invalid header"),
     (b"", "has no end"),
-], ids=["negative", "nested", "large", "no header", "cut"])  # fmt: skip
+], ids=["negative", "huge", "negative by pax", "nested", "large", "no header", "cut"])  # fmt: skip
 def test_strange_headers_end_one_archive_alone(
     objects, made, strange, tmp_path, suffix, behind, said
 ):
@@ -280,6 +284,37 @@ def test_nothing_is_taken_from_a_gzip_archive_whose_checksum_is_wrong(
     (line,) = [text for about, text in summary.problems if about == path.name]
     assert "is no intact tar archive (CRC check failed" in line and "download it again" in line
     assert open_store(tmp_path / "s.zarr").ids == [IDS[0]]
+
+
+def test_no_flipped_bit_of_a_gzip_archive_changes_a_file(strange):
+    rng = np.random.default_rng(5)
+    wanted = {
+        f"o{k}/sample_0/material_grid.npy": rng.integers(0, 9, 20_000, np.uint8) for k in range(4)
+    }
+    path = strange / "tree.tar.gz"
+    with tarfile.open(path, "w:gz") as archive:
+        for name, values in wanted.items():
+            add(archive, name, values.tobytes())
+    whole, told = path.read_bytes(), 0
+    for at, bit in zip(rng.integers(20, len(whole), 60), rng.integers(0, 8, 60), strict=True):
+        flipped = bytearray(whole)
+        flipped[at] ^= 1 << int(bit)
+        path.write_bytes(flipped)
+        made = Archive.on_disk(path, GRIDS)
+        index = made.index()
+        told += bool(index.fault)
+        for name, entry in index.members.items():
+            assert made.read(entry) == wanted[name].tobytes()
+    assert told > 50
+
+
+def test_junk_behind_a_gzip_archive_is_left_alone(strange):
+    path = strange / "tree.tar.gz"
+    with tarfile.open(path, "w:gz") as archive:
+        add(archive, "o/sample_0/material_grid.npy", b"grid")
+    path.write_bytes(path.read_bytes() + b"junk")
+    index = Archive.on_disk(path, GRIDS).index()
+    assert not index.fault and len(index.members) == 1
 
 
 def test_an_archive_that_is_none_is_named_where_it_lies(objects, made, strange, tmp_path):
@@ -316,8 +351,10 @@ def test_what_lies_beside_archives_and_is_not_read_is_told(objects, made, strang
     told: list[str] = []
     discover(parameters(made, strange), told.append)
     assert not [text for text in told if "beside" in text]
-    (strange / IDS[1]).mkdir()
-    (strange / "b.tar.xz").touch()
+    for name in (".cache", IDS[1]):
+        (strange / name).mkdir()
+    for name in ("._x.zip", "a.tar.sha256", "b.tar.xz"):
+        (strange / name).touch()
     discover(parameters(made, strange), told.append)
     said = f"{strange}: its archives are read, but not {IDS[1]} and 1 more beside them"
     assert [text for text in told if "beside" in text] == [said]

@@ -245,6 +245,12 @@ def test_a_further_source_without_use_is_named(own, tmp_path):
     (own.root / "away" / "b").rename(third / "x")
     with pytest.raises(ConfigError, match=r"third: has none of the objects .* 'a', found 'x'"):
         build_store(asked(own), tmp_path / "s.zarr")
+    # Nothing is said against a further source while the first one is damaged.
+    shutil.rmtree(own.root / "pixieverse")
+    (own.root / "pixieverse").mkdir()
+    (own.root / "pixieverse/torn.tar").write_bytes(b"<html>" * 1000)
+    with pytest.raises(StoreError, match=r"torn\.tar: cannot be listed \(is no intact tar"):
+        build_store(asked(own), tmp_path / "t.zarr")
 
 
 def test_what_fails_is_left_out_and_named_and_an_asset_fails_when_none_is_left(own, tmp_path):

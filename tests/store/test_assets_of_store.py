@@ -123,6 +123,11 @@ def test_what_is_changed_in_an_asset_or_table_changes_nothing_in_the_store(made)
     for change in (store.ids.sort, store.ids.reverse, store.ids.pop, store.ids.clear):
         with pytest.raises(TypeError, match="change a copy"):
             change()
+    with pytest.raises(TypeError, match="change a copy"):
+        del store.ids[0]
+    for change in (store.ids.__iadd__, store.ids.__imul__, store.ids.extend):
+        with pytest.raises(TypeError, match="change a copy"):
+            change(["dog"])
     assert store.ids == list(IDS) == pickle.loads(pickle.dumps(store.ids))
 
 

@@ -33,7 +33,8 @@ const Format = (() => {
   /** An SI value from its mapped one: 10^7.3 as 2.0 × 10⁷. */
   const scientific = (exponent) => {
     const power = Math.floor(exponent + 1e-9);
-    if (power >= 0 && power < 4) return String(Number((10 ** exponent).toPrecision(3)));
+    const plain = Number((10 ** exponent).toPrecision(3));
+    if (power >= 0 && plain < 1e4) return String(plain);
     const [mantissa, rounded] = (10 ** exponent).toExponential(1).split("e");
     return `${mantissa} × 10${superscript(Number(rounded))}`;
   };

@@ -193,7 +193,7 @@ const Sections = (() => {
     else {
       const step = 10 ** Math.floor(Math.log10(domain[1] - domain[0]));
       const digits = Math.max(0, -Math.log10(step));
-      for (let k = Math.ceil(domain[0] / step); k * step <= domain[1]; k++) ticks.push({ at: k * step, text: (k * step).toFixed(digits) });
+      for (let k = Math.ceil(domain[0] / step); k * step <= domain[1]; k++) ticks.push({ at: k * step, text: Format.fixed(digits)(k * step) });
     }
     return Charts.histogram({
       title: `${name}${unit && ` [${unit}]`}, before`,
@@ -229,7 +229,7 @@ const Sections = (() => {
     const rows = CONTENT.balance.map((row) => {
       const all = row.classes.reduce((sum, count) => sum + count, 0);
       return {
-        label: row.category || "(unknown)",
+        label: row.category === "(unknown)" ? `"${row.category}"` : row.category || "(unknown)",
         choose: () => filter.only({ category: row.category, states: STORED }),
         parts: row.classes.flatMap((count, id) => (count ? [{ colour: colours[id], share: count / all, title: `${names[id]} ${Format.share(count / all)}` }] : [])),
         number: Format.plural(row.assets, "asset"),
