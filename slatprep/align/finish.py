@@ -31,6 +31,9 @@ MOST_CONTESTED = 4
 """Largest number of placements that are deformed and compared, if the best one is deformed or the
 sides are rough. The others score within twice `TIE` of the best."""
 
+LEAST_SPREAD = 1e-4
+"""Least standard error of a mean kernel; below it is rounding, as of a cube and its turns."""
+
 CONTEST_SAMPLES, SHARP = 2_000, 0.5
 """Samples per side on which placements are compared, and the kernel's width [voxel]. It is narrower
 than in a fit, as a front may differ from a back in fine details only."""
@@ -111,8 +114,8 @@ def _told_apart(
     found = []
     for pose, fit in zip(poses, fits, strict=True):
         gains = np.bincount(blocks, kernels - _kernels(pair, fit)[0])
-        spread = float(np.sqrt((gains**2).sum()))
-        found.append(replace(pose, behind=float(gains.sum()) / spread if spread else 0.0))
+        spread = max(float(np.sqrt((gains**2).sum())), LEAST_SPREAD)
+        found.append(replace(pose, behind=float(gains.sum()) / spread))
     return found
 
 

@@ -242,6 +242,8 @@ def align(
     parameters = sources.parameters()
     from slatprep.pipeline import dataset as build
 
+    if parameters.consensus.settle or parameters.witness.settle:
+        output.note("note:    consensus and witness are passes of a build, and are left out here")
     with workers.started(output) as jobs, output.progress("align") as progress:
         summary = build.align_pairs(
             parameters,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import pkgutil
 import sys
 from typing import Any, NoReturn
@@ -110,7 +111,8 @@ class LazyGroup(click.Group):
             # A disk or an object store failed at a place without a message of its own.
             if error.filename is None:
                 raise
-            say(f"slatprep: error: {error.filename}: {error.strerror}; run again", err=True)
+            advice = "give a shorter name" if error.errno == errno.ENAMETOOLONG else "run again"
+            say(f"slatprep: error: {error.filename}: {error.strerror}; {advice}", err=True)
             ctx.exit(output.EXIT_INCOMPLETE)
         except KeyboardInterrupt as stop:
             told = str(stop) or getattr(ctx.obj, "if_stopped", output.NOTHING_REPLACED)

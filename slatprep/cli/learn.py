@@ -137,8 +137,11 @@ def train(
 
     source = click.get_current_context().get_parameter_source
     given = {
-        name: source(name) is not click.core.ParameterSource.DEFAULT for name in ("epochs", *_PAPER)
+        name: source(name) is not click.core.ParameterSource.DEFAULT
+        for name in ("epochs", "size", *_PAPER)
     }
+    if all_sizes and given["size"]:
+        raise click.UsageError("--all-sizes and --size both say which sizes; give one of them")
     if training.steps and given["epochs"]:
         raise click.UsageError("--epochs and --steps both say when to end; give one of them")
     if preset == "paper":

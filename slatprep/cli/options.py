@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 import click
 
 from slatprep.cli.output import Output
-from slatprep.cli.signature import Click, NewPath
+from slatprep.cli.signature import Click, NewPath, SomePath
 from slatprep.errors import amount, tally
 from slatprep.storage.place import place_of, storage_of
 
@@ -55,13 +55,15 @@ class Whole(click.IntRange):
         return number
 
 
-class PlaceType(click.Path):
+class PlaceType(SomePath):
     """A path, which click checks, or the URL of an object store, which is not checked."""
 
     def convert(
         self, value: Any, parameter: click.Parameter | None, context: click.Context | None
     ) -> Any:
         """Return the value as a place."""
+        if value == "":
+            return super().convert(value, parameter, context)
         place = place_of(value)
         if str(place).startswith("memory://"):
             self.fail(
@@ -96,15 +98,15 @@ Above0 = Annotated[float, FiniteRange(min=0, min_open=True)]
 Count = Annotated[int, Whole(min=0)]
 Seed = Count
 """A seed of NumPy's generators, which must not be negative."""
-File = Annotated[Path, click.Path(path_type=Path, exists=True, dir_okay=False)]
-Folder = Annotated[Path, click.Path(path_type=Path, exists=True, file_okay=False)]
-FileOrFolder = Annotated[Path, click.Path(path_type=Path, exists=True)]
+File = Annotated[Path, SomePath(path_type=Path, exists=True, dir_okay=False)]
+Folder = Annotated[Path, SomePath(path_type=Path, exists=True, file_okay=False)]
+FileOrFolder = Annotated[Path, SomePath(path_type=Path, exists=True)]
 NewFile = Annotated[Path, NewPath(path_type=Path, dir_okay=False)]
 NewFolder = Annotated[Path, NewPath(path_type=Path, file_okay=False)]
 NewFileOrFolder = Annotated[Path, NewPath(path_type=Path)]
 RecordsFolder = Annotated[
     Path,
-    click.Path(path_type=Path, file_okay=False),
+    SomePath(path_type=Path, file_okay=False),
     "Folder for the records. [default: beside the store]",
 ]
 """Folder for a build's records; the build itself checks an existing folder."""

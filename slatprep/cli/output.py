@@ -90,7 +90,7 @@ class Output:
         """With ``--json``, print an error that ends the command as JSON too."""
         try:
             yield
-        except (SlatprepError, click.UsageError) as error:
+        except (SlatprepError, click.UsageError, OSError) as error:
             if self.as_json:
                 told = error.format_message() if isinstance(error, click.UsageError) else str(error)
                 self._say_document(False, {"error": told})

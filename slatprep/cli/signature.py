@@ -180,7 +180,19 @@ def _taken_apart(hint: Any) -> tuple[Any, bool, tuple[Any, ...]]:
     return hint, False, ()
 
 
-class NewPath(click.Path):
+class SomePath(click.Path):
+    """A path, which must not be empty: that would be the working folder."""
+
+    def convert(
+        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
+    ) -> Any:
+        """Return the value as a path."""
+        if value == "":
+            self.fail("is empty; expected a path", parameter, context)
+        return super().convert(value, parameter, context)
+
+
+class NewPath(SomePath):
     """A path of the local disk that a command writes; `require_apart` checks it."""
 
 

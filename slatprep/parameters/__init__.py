@@ -152,6 +152,13 @@ class AlignParameters(_Group):
     icp_radius: Length = 3.2
     icp_iterations: PositiveInt = 60
 
+    def __post_init__(self) -> None:
+        rigid = self.engine in (Engine.OPEN3D, Engine.SMALL_GICP)
+        if rigid and self.model not in ("auto", "rigid"):
+            raise ValueError(
+                f"model = 'rigid' or 'auto' where engine = '{self.engine}', a rigid ICP"
+            )
+
 
 @dataclass(frozen=True)
 class ConsensusParameters(_Group):

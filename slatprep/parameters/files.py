@@ -179,6 +179,8 @@ def _read(path: Path) -> dict[str, Any]:
     folder = path.resolve().parent
     for name, table, key in _paths_of(data):
         value = table[key]
+        if value == "" and key != "transform":
+            raise ConfigError(f"{path}: {name} is empty; expected a path, or no such line")
         if isinstance(value, str) and value and _is_path(key, value):
             try:
                 table[key] = str(place_of(value, folder))

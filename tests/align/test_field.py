@@ -28,6 +28,7 @@ from slatprep.geometry.frames import (
     displacement,
     invert_transform,
     make_transform,
+    places_of,
     split_transform,
 )
 from slatprep.geometry.voxels import boundary, voxels_of
@@ -73,6 +74,20 @@ ACCURACY = {
     3: (0.3, 0.6, 0.005),
     4: (1.0, None, 0.005),
 }
+
+
+@pytest.mark.parametrize("seed", [23, 30, 37])
+def test_rounding_tells_no_turn_of_a_cube_from_another(seed):
+    rng = np.random.default_rng(seed)
+    half, turn = rng.integers(3, 16), distinct_starts()[rng.integers(24)].rotation
+    frame = make_transform(turn, rng.uniform(-4, 4, 3) / 64, rng.uniform(0.7, 1.5))
+    points = ((GRID + 0.5) / 64 - 0.5).reshape(-1, 3)
+    here, there = (
+        (abs(64 * places) <= half).all(axis=1).reshape(64, 64, 64)
+        for places in (points, places_of(points, frame))
+    )
+    found = align(field_of(here), surface_latents(there), AlignParameters())
+    assert found.figures is not None and abs(found.figures.clear_by) < 0.1
 
 
 @pytest.mark.parametrize("level", ACCURACY)

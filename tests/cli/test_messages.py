@@ -91,6 +91,13 @@ def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use_everywhere(
     ("train STORE --out NEW --seed -1", 2, "-1 is not in the range"),
     ("align --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below GRIDS"),
     ("build-store --pixieverse SLAT --slat GRIDS --out NEW", 2, "swapped: grids lie below"),
+    # A variable of the shell that is not set, and a name that is too long.
+    ("stats STORE --csv=", 2, "Invalid value for '--csv': is empty; expected a path"),
+    ("build-store --pixieverse= --slat SLAT --out NEW", 2, "'--pixieverse': is empty"),
+    ("build-store --pixieverse GRIDS --slat SLAT --out NEW --manifests=", 2, "is empty"),
+    ("subset STORE --asset cup --out=", 2, "'--out': is empty"),
+    (f"report STORE --out NEW{300 * 'w'}", 1, "File name too long"),
+    ("train STORE --out NEW --all-sizes --size small", 2, "both say which sizes"),
     # Numbers beyond reason, and words in place of numbers.
     ("build-store --rehash nan", 2, "Invalid value for '--rehash'"),
     (f"measure-errors --seed {10**26}", 2, "Invalid value for '--seed'"),
