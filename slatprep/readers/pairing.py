@@ -108,16 +108,8 @@ def discover(
     grids, slats = each[0], find_slats(slat, folder != slat.root)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
-    damaged = dict[str, list[adapters.FoundField]]()
-    sound = not any(found[0].problem for found in grids.values())
-    for source, others in zip(parameters.also, each[1:], strict=True):
-        unusable = dict.fromkeys(name for name, found in others.items() if found[0].problem)
-        if sound and not unusable and others.keys().isdisjoint(grids):
-            raise ConfigError(
-                f"{source.root}: has none of the objects that [pixieverse] has; expected ids such "
-                f"as {min(grids)!r}, found {min(others)!r}"
-            )
-        damaged |= {name: [] for name in unusable}
+    damaged: dict[str, list[adapters.FoundField]]
+    damaged = {name: [] for name in _damaged_in(parameters.also, each)}
     rows = list(_rows(damaged | grids, slats, claims, each_sample=pixieverse.samples == "all"))
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     contents, cases = contents_of(parameters), by_case(grids, slats)
@@ -127,7 +119,42 @@ def discover(
             places[k], folder, contents, source.adapter, k, (), source.units, source.plausibility
         )
         found.append(_Found(source, slat, roots, listings[k], each[k], categories, cases))
-    return list(_pairs(rows, found))
+    pairs = list(_pairs(rows, found))
+    if note is not None:
+        for line in _unused(pairs, sources):
+            note(line)
+    return pairs
+
+
+def _damaged_in(
+    also: Sequence[PixieverseSource], each: Sequence[Mapping[str, list[adapters.FoundField]]]
+) -> set[str]:
+    """Return the names of what cannot be read in further sources, such as damaged archives.
+
+    `each` has the grids of all sources. ConfigError if a further one has no object of the first.
+    """
+    grids, *others = each
+    broken = [{name for name, found in one.items() if found[0].problem} for one in each]
+    for source, own, faults in zip(also, others, broken[1:], strict=True):
+        if not (broken[0] or faults) and own.keys().isdisjoint(grids):
+            raise ConfigError(
+                f"{source.root}: has none of the objects that [pixieverse] has; expected ids such "
+                f"as {min(grids)!r}, found {min(own)!r}"
+            )
+    return set().union(*broken[1:])
+
+
+def _unused(pairs: Sequence[AssetPair], sources: Sequence[PixieverseSource]) -> Iterator[str]:
+    """Yield a line for masks and bounds whose patterns are given, but name no file."""
+    for number, source in enumerate(sources):
+        for role in ("mask", "bounds"):
+            given = getattr(source, role)
+            if not given or given == getattr(PixieverseSource, role):
+                continue
+            annotations = chain.from_iterable(pair.annotations for pair in pairs)
+            own = (getattr(one, role) for one in annotations if one.roots.number == number)
+            if not any(own):
+                yield f"{source.root}: no {role} found; looked for {tried_names(given, {})}"
 
 
 def _grids_of(

@@ -15,6 +15,7 @@ import pytest
 from support.memory import less_than
 from support.published import pack
 from support.raw_sources import COORDS, FEATS, grid, raw_grid, touch
+from support.synthetic import Dataset
 
 from slatprep.errors import ConfigError, InputError, MissingPartnerError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
@@ -200,6 +201,17 @@ def hdf5(path: Path, *groups: str) -> None:
         for group in groups:
             file[f"{group}/coords"] = COORDS
             file[f"{group}/feats"] = FEATS
+
+
+def test_patterns_of_masks_that_name_no_file_are_told(tmp_path):
+    dataset, told = Dataset(tmp_path).having("a"), list[str]()
+    for pixieverse in ({}, {"mask": []}, {"mask": ["{id}/nope.npy"], "bounds": ["one.npz"]}):
+        discover(dataset.parameters(pixieverse=pixieverse), told.append)
+    root = tmp_path / "pixieverse"
+    assert told == [
+        f"{root}: no mask found; looked for */nope.npy",
+        f"{root}: no bounds found; looked for one.npz",
+    ]
 
 
 def test_hdf5_with_a_group_per_asset(find, tmp_path):
