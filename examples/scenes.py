@@ -103,7 +103,7 @@ def objects(options: argparse.Namespace) -> dict[str, tuple[np.ndarray, VoxelFie
         ranges = PIXIE_RANGES if ranges == "pixie" else read_ranges(Path(ranges))
     for path in options.prediction:
         field = predicted_field(path, ranges)
-        found[path.stem] = field.voxels, field
+        found[path.stem] = field.cells, field
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.errors import ConfigError, InputError
 from slatprep.export.formats import require_solver_classes
 from slatprep.geometry.deformation import PlaceMap
+from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.learn.predictions import GivenPrediction, read_npz
 from slatprep.normalize import PIXIE_RANGES, denormalize_properties
@@ -39,19 +40,56 @@ class VoxelField:
     Attributes
     ----------
     voxels : ndarray of uint8, shape (K, 3)
-        The voxels that have a material, K >= 1, each once.
+        The voxels of a grid of `resolution` that have a material, K >= 1, each once.
     material : ndarray of uint8, shape (K,)
         Class 0..6.
     properties : ndarray of float32, shape (K, 3)
         Young's modulus [Pa], density [kg/m^3], Poisson's ratio.
     place_map : PlaceMap, optional
         The map from the SLAT frame to the voxels' frame; None if the frames are the same.
+    resolution : int
+        Voxels along each axis: 64, or more for a SLAT of a finer grid.
     """
 
     voxels: NDArray[np.uint8]
     material: NDArray[np.uint8]
     properties: NDArray[np.float32]
     place_map: PlaceMap | None = None
+    resolution: int = RESOLUTION
+
+    @classmethod
+    def of_slat(
+        cls,
+        coords: NDArray[np.uint8],
+        side: int,
+        material: NDArray[np.uint8],
+        properties: NDArray[np.float32],
+    ) -> Self:
+        """Return a field of SLAT voxels of any grid; voxels of a coarser one are cells of 64^3."""
+        if side > RESOLUTION:
+            return cls(coords, material, properties, resolution=side)
+        cells, row = shown_in_cells(coords, side)
+        return cls(cells, material[row], properties[row])
+
+    @property
+    def cells(self) -> NDArray[np.uint8]:
+        """The cells (M, 3) of the 64^3 grid that the voxels occupy."""
+        return shown_in_cells(self.voxels, self.resolution)[0]
+
+    def nearest(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Return distance (N,), in 1/64 of the cube's edge, and row of the nearest voxel.
+
+        The points (N, 3) lie in the SLAT frame.
+        """
+        located = self.locate(points)
+        if self.resolution == RESOLUTION:
+            from slatprep.geometry.nearest import VoxelIndex
+
+            return VoxelIndex(self.voxels).nearest(located)
+        from scipy.spatial import cKDTree
+
+        apart, row = cKDTree(voxel_centres(self.voxels, self.resolution)).query(located)
+        return apart * RESOLUTION, row
 
     def locate(self, points: ArrayLike) -> NDArray[np.float64]:
         """Map points (N, 3) of the SLAT frame to the frame of the voxels."""
@@ -75,8 +113,8 @@ def stored_field(store: Store, name: str | int, points: Points = "slat") -> Voxe
     else:
         valid = asset.valid
         values = asset.properties_si[valid][:, columns]
-        cells, row = shown_in_cells(asset.coords[valid], store.contents.latents.resolution)
-        field = VoxelField(cells, asset.material[valid][row], values[row])
+        side = store.contents.latents.resolution
+        field = VoxelField.of_slat(asset.coords[valid], side, asset.material[valid], values)
     if len(field.voxels) == 0:
         raise ConfigError(
             f"{store.path}: no voxel of {asset.asset_id} has a material; expected an asset whose "
@@ -129,5 +167,5 @@ def predicted_field(path: Path, normalization: Normalization | None) -> VoxelFie
             f"row {first} has class {material[first]} and properties {values[first].tolist()}",
             f"in every valid row class 0..6, {', '.join(one.allowed for one in PROPERTIES)}",
         )
-    cells, row = shown_in_cells(coords[valid], side)
-    return VoxelField(cells, material[valid].astype(np.uint8)[row], values[valid][row])
+    classes = material[valid].astype(np.uint8)
+    return VoxelField.of_slat(coords[valid], side, classes, values[valid])

@@ -65,7 +65,7 @@ def prepare(
     The SLAT's voxels `cells`, by default those of the field, are the surface of the object. Class,
     Young's modulus [Pa] and density [kg/m^3] are for the whole object; None keeps the field's.
     """
-    solid = filled(occupancy_of(field.voxels if cells is None else cells))
+    solid = filled(occupancy_of(field.cells if cells is None else cells))
     lattice = (np.indices((count,) * 3).reshape(3, -1).T + 0.5) / count - 0.5
     inside = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
     positions = lattice[solid[tuple(inside.T)]]

@@ -48,7 +48,7 @@ class Transferred:
     properties : ndarray of float32, shape (M, 3)
         Young's modulus [Pa], density [kg/m^3], Poisson's ratio; 0 for background.
     distance : ndarray of float64, shape (M,)
-        Distance to the nearest voxel, in voxels of the field.
+        Distance to the nearest voxel, in voxels of a 64^3 grid.
     far : int
         Number of particles without a voxel within `max_distance`.
     """
@@ -68,12 +68,10 @@ def transfer(
     A particle without a voxel within `max_distance` voxels is far. It gets class 7 and properties 0
     (background), no row (drop), or the nearest voxel's material (nearest).
     """
-    from slatprep.geometry.nearest import VoxelIndex
-
     require_one_of("far", far, get_args(Far))
     if not max_distance > 0:
         raise ConfigError(f"max_distance is {max_distance}; expected a number above 0")
-    distance, used = VoxelIndex(field.voxels).nearest(field.locate(points))
+    distance, used = field.nearest(points)
     near = distance <= max_distance
     taken = near | (far == "nearest")
     material = np.where(taken, field.material[used], np.uint8(BACKGROUND))
@@ -177,7 +175,7 @@ def _enclosed(field: VoxelField, points: NDArray[np.float64]) -> float:
     """Return the share of points in the SLAT frame that the field's voxels enclose."""
     voxels = np.floor((field.locate(points) + 0.5) * RESOLUTION).astype(int)
     there = ((voxels >= 0) & (voxels < RESOLUTION)).all(axis=1)
-    solid = filled(occupancy_of(field.voxels))
+    solid = filled(occupancy_of(field.cells))
     return float(solid[tuple(voxels[there].T)].sum() / max(len(points), 1))
 
 

@@ -218,13 +218,15 @@ def test_a_solid_on_a_surface_is_told_of_points_grid(tmp_path):
     assert "100% of them lie inside the object" in said and "--points grid" in said
 
 
-def test_nearest_is_nearest_by_brute_force():
+@pytest.mark.parametrize("side", [64, 128, 256])
+def test_nearest_is_nearest_by_brute_force(side):
     rng = np.random.default_rng(1)
-    voxels = rng.permutation(np.argwhere(np.ones((64,) * 3)))[:400].astype(np.uint8)
+    voxels = np.unique(rng.integers(0, side, (500, 3)), axis=0)
+    voxels = rng.permutation(voxels)[:400].astype(np.uint8)
     values = np.tile(np.arange(400, dtype=np.float32)[:, None], 3)
-    field = VoxelField(voxels, (np.arange(400) % 7).astype(np.uint8), values)
+    field = VoxelField.of_slat(voxels, side, (np.arange(400) % 7).astype(np.uint8), values)
     points = rng.uniform(-0.6, 0.6, (700, 3))
-    apart = np.linalg.norm(points[:, None] - ((voxels + 0.5) / 64 - 0.5)[None], axis=2) * 64
+    apart = np.linalg.norm(points[:, None] - ((voxels + 0.5) / side - 0.5)[None], axis=2) * 64
     result = transfer(points, field, max_distance=6.0, far="nearest")
     np.testing.assert_array_equal(result.properties[:, 0], apart.argmin(axis=1))
     np.testing.assert_allclose(result.distance, apart.min(axis=1), atol=1e-9)
@@ -263,6 +265,19 @@ def test_prediction_is_transferred_as_the_store_is(store, tmp_path):
     ):
         run(tmp_path / "points.npz", *words, "--out", tmp_path / f"{name}.ply")
     assert (tmp_path / "stored.ply").read_bytes() == (tmp_path / "predicted.ply").read_bytes()
+
+
+@pytest.mark.parametrize("side", [32, 64, 128])
+def test_a_particle_at_a_voxel_s_centre_gets_its_material(tmp_path, side):
+    block = np.argwhere(np.ones((6, 6, 6))) + side // 3
+    kinds = block.sum(axis=1) % 2
+    stuff = np.array([[1e5, 1e3, 0.3], [1e9, 2e3, 0.4]], np.float32)[kinds]
+    arrays = {"coords": block, "material": kinds, "properties_si": stuff}
+    np.savez(tmp_path / "p.npz", resolution=side, **arrays)
+    found = transfer((block + 0.5) / side - 0.5, predicted_field(tmp_path / "p.npz", None))
+    np.testing.assert_array_equal(found.material, kinds)
+    np.testing.assert_array_equal(found.properties, stuff)
+    assert found.far == 0 and (found.distance.max() < 1e-9 or side < 64)
 
 
 def test_prediction_in_si_needs_no_ranges(tmp_path):
