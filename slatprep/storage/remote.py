@@ -10,6 +10,7 @@ The libraries find credentials and endpoints; for S3, for instance, in ``AWS_*``
 from __future__ import annotations
 
 import errno
+import glob
 import io
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -285,7 +286,8 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
     """Remove objects below a place by their names; missing ones are no error."""
     if names := list(names):
         with connected(place) as (system, root):
-            system.rm([f"{root}/{name}" for name in names])
+            # fsspec takes each of these for a pattern, and ``a[1]`` would stand for ``a1``.
+            system.rm([glob.escape(f"{root}/{name}") for name in names])
 
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"

@@ -180,10 +180,13 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
     digests = {**{name: file_digest(new / name) for name in unknown}, **staged.digests}
     sizes, content = {**files, **staged.sizes}, versions.content_of(digests)
     if before.pointer is not None and before.pointer.content == content:
-        if place is not None:
-            with writing(str(before.target), before.target):
-                remove_objects(place, list_objects(place))
-        return Upload(before, before.pointer)
+        current = Upload(before, before.pointer)
+        with writing(str(before.target), before.target):
+            # A version that somebody damaged is no reason to upload nothing.
+            if _holds(current.version, new, files, sizes):
+                if place is not None:
+                    remove_objects(place, list_objects(place))
+                return current
     previous = before.pointer.version if before.pointer else ""
     own = hashlib.sha256(f"{previous}{content}".encode()).hexdigest()[:16]
     now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -215,6 +218,14 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
                     "replaced. If another build has just replaced the store, run again"
                 )
     return upload
+
+
+def _holds(version: RemotePlace, new: Path, files: Iterable[str], sizes: Mapping[str, int]) -> bool:
+    """Return whether a version has all files by their sizes, and the local ones by their tags."""
+    there = list_objects(version)
+    return all(there.get(name, {}).get("size") == size for name, size in sizes.items()) and all(
+        _is_tagged(there[name], new / name) is not False for name in files
+    )
 
 
 def _is_tagged(entry: Mapping[str, Any], file: Path) -> bool | None:

@@ -16,7 +16,14 @@ from slatprep.records import Place
 from slatprep.storage.cache import VARIABLE, cache_folder, cached_file, folder_for
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.ranges import range_reader
-from slatprep.storage.remote import RemoteFile, RemotePlace
+from slatprep.storage.remote import (
+    RemoteFile,
+    RemotePlace,
+    copy_objects,
+    list_objects,
+    put_objects,
+    remove_objects,
+)
 
 
 @pytest.mark.parametrize(
@@ -103,6 +110,21 @@ def test_objects_that_no_path_could_name_are_left_out(s3, bucket):
     assert not names.is_file("b")
     with pytest.raises(Exception, match="no plain name below its root"):
         load_source(root / "b" / ".." / "a", root, "grid")
+
+
+@pytest.mark.parametrize("name", ["a[1]", "a*", "a?", "a{1,2}"])
+def test_no_name_stands_for_others(s3, bucket, tmp_path, name):
+    (tmp_path / "x").write_bytes(b"new")
+    for folder in ("a1", "a2"):
+        s3.pipe_file(f"{bucket}/{folder}/x", b"x")
+    place, other = (place_of(f"s3://{bucket}/{one}") for one in (name, f"{name}b"))
+    put_objects(tmp_path, place, ["x"])
+    copy_objects(place, other, ["x"])
+    for one in (place, other):
+        assert (one / "x").read_bytes() == b"new" and [*list_objects(one)] == ["x"]
+        remove_objects(one, ["x"])
+        assert not (one / "x").exists()
+    assert all(s3.cat_file(f"{bucket}/{folder}/x") == b"x" for folder in ("a1", "a2"))
 
 
 def test_a_file_that_is_too_large_is_not_read_whole(s3, bucket, monkeypatch):

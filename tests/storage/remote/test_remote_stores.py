@@ -102,6 +102,19 @@ def test_what_did_not_change_is_neither_aligned_nor_uploaded_again(s3, url, make
     assert contents(s3, url).keys() == first.keys()
 
 
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_damaged_version_is_uploaded_anew(s3, url, make_dataset, gone):
+    dataset = make_dataset("a", "b")
+    build_store(dataset.parameters("pixie"), url)
+    whole = current(s3, url)
+    (key,) = [one for one in contents(s3, url) if one.endswith("voxel/material/c/0")]
+    name = f"{url.removeprefix('s3://')}/{key}"
+    data = s3.cat_file(name)
+    s3.rm_file(name) if gone else s3.pipe_file(name, data[:-1] + bytes([data[-1] ^ 1]))
+    build_store(dataset.parameters("pixie"), url, fresh=True)
+    assert current(s3, url) == whole and verify_store(url).ok
+
+
 def test_one_older_version_is_kept_or_more_are_told(s3, url, undisturbed, another, new_clients):
     first = put(another[1], url)
     reader, known = open_store(url), open_store(another[1])
