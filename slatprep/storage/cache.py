@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import tempfile
 from pathlib import Path
+
+import orjson
 
 from slatprep.errors import StoreError
 from slatprep.storage.files import file_digest
@@ -71,8 +74,8 @@ def short(text: str) -> str:
 def copied_version(place: RemotePlace) -> Path:
     """Return the local copy of a store's version, after making it if needed.
 
-    Versions never change, so a copy is made once. StoreError if the place is no version, differs
-    from its pointer, or cannot be copied.
+    Versions never change, so a copy is made once, or again if somebody removed or cut its files.
+    StoreError if the place is no version, differs from its pointer, or cannot be copied.
     """
     if not is_version(place):
         raise StoreError(
@@ -81,8 +84,8 @@ def copied_version(place: RemotePlace) -> Path:
         )
     store = place.parent.parent
     folder = folder_for(store) / place.name
-    copy = folder / store.name
-    if copy.is_dir():
+    copy, sizes = folder / store.name, folder / f".{store.name}.sizes"
+    if _is_whole(copy, sizes):
         return copy
     try:
         pointer = read_pointer(store)
@@ -106,8 +109,21 @@ def copied_version(place: RemotePlace) -> Path:
                         f"{place}: the copy is not what was published there; run again, and if "
                         f"that does not help, `slatprep verify {store}` names what is damaged"
                     )
-            if not copy.is_dir():  # Another process may have been faster.
+            if not _is_whole(copy, sizes):  # Another process may have been faster.
+                shutil.rmtree(copy, ignore_errors=True)
+                text = {name: entry["size"] for name, entry in objects.items()}
+                Path(own, "sizes").write_bytes(orjson.dumps(text))
+                Path(own, "sizes").replace(sizes)
                 part.rename(copy)
     except OSError as error:
         raise StoreError(f"{place}: cannot be copied to {folder} ({error.strerror})") from None
     return copy
+
+
+def _is_whole(copy: Path, sizes: Path) -> bool:
+    """Return whether a copy has all its files, by their sizes."""
+    try:
+        known = orjson.loads(sizes.read_bytes())
+        return all((copy / name).stat().st_size == size for name, size in known.items())
+    except (OSError, ValueError):
+        return False

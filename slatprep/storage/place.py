@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
 
-from slatprep.errors import InputError, StoreError
+from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.storage.archives import Archive
 from slatprep.storage.atomic import staged, staged_apart
 from slatprep.storage.cache import cached_file, copied_version, folder_for
@@ -73,6 +73,8 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
         raise TypeError(f"{text!r} is no place; expected a path or a URL")
     url = _URL.fullmatch(str(text))
     if url and url[1] not in _LOCAL:
+        if ".." in url[2].split("/") or not url[2].isprintable():
+            raise ConfigError(f"{url[0]!r} has '..' or a control character; expected a plain URL")
         return RemotePlace(url[1], PurePosixPath(url[2]))
     path = Path("/", url[2]) if url else Path(str(text))
     return path if folder is None else (folder / path.expanduser()).resolve()

@@ -105,10 +105,10 @@ def test_its_points_are_the_voxels_centres(demo, tmp_path):
     again = predicted_field(file, store.normalization)
     np.testing.assert_array_equal(again.voxels, field.voxels)
     np.testing.assert_array_equal(again.material, field.material)
-    # The material of each cell is that of a voxel whose centre is no farther than half a voxel.
+    # A cell or voxel has the material of a voxel whose centre is no farther than half a voxel.
     tree = cKDTree(centres_of(asset.coords[asset.valid], side))
-    reach = 0.5 / min(side, 64) * np.sqrt(3) + 1e-9
-    near = tree.query_ball_point(centres_of(field.voxels, 64), reach)
+    reach = 0.5 / min(side, field.resolution) * np.sqrt(3) + 1e-9
+    near = tree.query_ball_point(centres_of(field.voxels, field.resolution), reach)
     material = asset.material[asset.valid]
     assert all(field.material[k] in material[some] for k, some in enumerate(near))
 

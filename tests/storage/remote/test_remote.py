@@ -47,6 +47,12 @@ def test_a_url_is_a_place_that_shows_as_a_url_and_all_else_a_local_path(place, s
     assert place_of(str(path)) == path == pickle.loads(pickle.dumps(path))
 
 
+@pytest.mark.parametrize("url", ["s3://b/a/../c", "s3://b/..", "s3://b/a\nc", "s3://b/\0"])
+def test_a_url_that_object_stores_take_differently_is_refused(url):
+    with pytest.raises(ConfigError, match="expected a plain URL"):
+        place_of(url)
+
+
 def test_places_below_a_url_are_named_as_paths_are():
     path = place_of("s3://bucket/a/demo.zarr")
     assert str(path / "x" / "y") == "s3://bucket/a/demo.zarr/x/y"

@@ -332,6 +332,22 @@ def test_a_copy_is_made_once_and_no_name_leads_out(s3, url, undisturbed, request
     assert storage_of(undisturbed[1]).copied_version() == undisturbed[1]
 
 
+@pytest.mark.parametrize("how", ["removed", "cut", "emptied"])
+def test_a_damaged_copy_is_made_again(url, undisturbed, how):
+    put(undisturbed[1], url)
+    copy = Path(str(open_store(url, copy=True).path))
+    file = copy / "voxel/material/c/0"
+    if how == "emptied":
+        shutil.rmtree(copy)
+        copy.mkdir()
+    elif how == "cut":
+        file.write_bytes(file.read_bytes()[:-1])
+    else:
+        file.unlink()
+    assert Path(str(open_store(url, copy=True).path)) == copy
+    assert tree(copy) == tree(undisturbed[1])
+
+
 def test_a_copy_that_differs_from_what_was_published_is_none(s3, url, undisturbed, tmp_path):
     flip(s3, f"{put(undisturbed[1], url)}/voxel/feats/c/0/0")
     with pytest.raises(StoreError, match=r"copy is not what was published there.*slatprep verify"):
