@@ -18,41 +18,37 @@ from slatprep.align.starts import distinct_starts, so3_starts
 from slatprep.records import MIRRORED
 
 REFLECTED = Steps(60, (3.0, 2.0, 1.0, 1.0), 0.02)
-WIDE, WIDE_STARTS, WIDE_KEPT = Steps(60, (8.0, 5.0, 3.0, 2.0), 0.02), 240, 6
+WIDE, WIDE_STARTS, WIDE_KEPT = Steps(100, (8.0, 5.0, 3.0, 2.0), 0.02), 240, 6
 NEXT, NEXT_KEPT = Steps(200, (2.0, 1.0, 1.0, 1.0), 0.01), 2
 LAST = POLISH._replace(taus=(1.0, 1.0, 1.0))
 """Steps of the search for a mirrored fit, with numbers of starts and of placements kept."""
 
-TRIAL_SAMPLES = 300
-"""Samples per side of the trial deformations that are compared."""
+FAIR = 0.9
+"""Score below which the found placement may itself be wrong, so all orientations are searched."""
 
 
 def mirror_gain(pair: Pair, found: Similarity, poor: bool) -> float:
     """Return the rise of the score once the SLAT is mirrored.
 
     Return NaN if the score of `found` is so high that it cannot rise by `MIRRORED`. If the fit is
-    `poor`, all orientations are searched, and scores are those after a trial deformation, if the
-    parameters allow one.
+    `poor`, scores are those after a trial deformation, if the parameters allow one.
     """
     (best,) = pair.refine([Pose(found)], POLISH._replace(taus=()))
     if best.score > 1.0 - MIRRORED:
         return float("nan")
     mirrored = pair.mirrored()
     tried = mirrored.refine(_reflected(pair, best.similarity), REFLECTED)
-    if not poor:
-        (other,) = mirrored.refine(_best(tried, 1), LAST)
-        return other.score - best.score
-    kept = _best(tried, NEXT_KEPT)
-    # Every second start is enough: several starts lead to a mirrored fit that is better.
-    rotations = [s.rotation for s in distinct_starts()] + list(so3_starts(WIDE_STARTS)[::2])
-    starts = mirrored.starts(rotations, pair.size_ratio)
-    kept += _best(mirrored.refine(starts, WIDE), WIDE_KEPT)
-    kept = _best(mirrored.refine(kept, NEXT), NEXT_KEPT)
-    if pair.may_deform:
-        there = try_out(mirrored.slat, pair.pixie, kept[0].similarity, TRIAL_SAMPLES)
-        here = try_out(pair.slat, pair.pixie, best.similarity, TRIAL_SAMPLES)
+    if best.score < FAIR:
+        # Every second start is enough: several starts lead to a mirrored fit that is better.
+        rotations = [s.rotation for s in distinct_starts()] + list(so3_starts(WIDE_STARTS)[::2])
+        wide = mirrored.refine(mirrored.starts(rotations, pair.size_ratio), WIDE)
+        tried = mirrored.refine(_best(tried, NEXT_KEPT) + _best(wide, WIDE_KEPT), NEXT)
+    kept = _best(tried, 1)
+    if poor and pair.may_deform:
+        there = try_out(mirrored.slat, pair.pixie, kept[0].similarity)
+        here = try_out(pair.slat, pair.pixie, best.similarity)
         return there.whole - here.whole
-    (other,) = mirrored.refine(kept[:1], LAST)
+    (other,) = mirrored.refine(kept, LAST)
     return other.score - best.score
 
 

@@ -228,6 +228,25 @@ def test_an_annotation_that_is_not_mirrored_is_not_told_to_be(seed):
     assert not found > 0.0
 
 
+def boxes(seed: int) -> NDArray[np.bool_]:
+    """Return a box with three others on it, which has several placements that fit nearly."""
+    rng = np.random.default_rng(seed)
+    solid, half = np.zeros((64, 64, 64), dtype=bool), rng.integers(8, 16, 3)
+    parts = [(np.full(3, 32), half)]
+    parts += [(rng.integers(32 - half, 33 + half), rng.integers(2, 7, 3)) for _ in range(3)]
+    for centre, size in parts:
+        solid[tuple(map(slice, centre - size, centre + size))] = True
+    return solid
+
+
+@pytest.mark.parametrize("seed", [1, 11, 19, 35])
+def test_a_mirrored_annotation_is_told_where_its_own_placement_is_wrong(seed):
+    """A reflection of that placement is none of the right one."""
+    solid = boxes(seed)
+    assert mirrored_gain(solid, turned(solid[::-1], seed)) > 3 * LIMIT
+    assert mirrored_gain(solid, turned(solid, seed)) < -3 * LIMIT
+
+
 def test_an_object_that_is_its_own_mirror_image_is_not_told_to_be_mirrored():
     """Bites on both sides, so that neither fits so well that no mirror is tried."""
     for at in ((14, 20, 43), (50, 40, 43)):
