@@ -85,7 +85,8 @@ def load_session(
     """Load TRELLIS's image pipeline; by default on the GPU if there is one.
 
     `model` is a repository or a folder of its files, `revision` a commit, tag or branch of the
-    repository. ConfigError if TRELLIS is not installed, or a folder is given a revision.
+    repository. ConfigError if TRELLIS is not installed, the model cannot be loaded, or a folder is
+    given a revision.
     """
     with redirect_stdout(sys.stderr):  # TRELLIS prints which kernels it takes when imported.
         try:
@@ -97,25 +98,33 @@ def load_session(
                 "installed. Install TRELLIS as https://github.com/microsoft/TRELLIS says, and "
                 "slatprep into the same environment. It needs an NVIDIA GPU of at least 16 GB"
             ) from error
-        if Path(model).is_dir():
-            if revision is not None:
-                raise ConfigError(
-                    f"{model} is a folder, which has no revision; leave --revision out"
-                )
-            folder, taken = Path(model), "local folder"
-        else:
+        local = Path(model).is_dir()
+        if local and revision is not None:
+            raise ConfigError(f"{model} is a folder, which has no revision; leave --revision out")
+        try:
             # Fetched first, so that the commit that is loaded is known.
-            from huggingface_hub import snapshot_download
-
-            folder = Path(snapshot_download(model, revision=revision))
-            taken = folder.name
-        pipeline = TrellisImageTo3DPipeline.from_pretrained(str(folder))
-        device = move(pipeline, torch, device)
+            folder = Path(model) if local else _fetched(model, revision)
+            pipeline = TrellisImageTo3DPipeline.from_pretrained(str(folder))
+            device = move(pipeline, torch, device)
+        except Exception as error:  # The hub's client, TRELLIS and torch have errors of any type.
+            reason = " ".join(str(error).split())
+            raise ConfigError(
+                f"the model {model} cannot be loaded ({type(error).__name__}: {reason}); expected "
+                "a folder of its files or a repository of Hugging Face, a network, a token in "
+                "HF_TOKEN if it is gated, and a device that PyTorch has"
+            ) from error
+        taken = "local folder" if local else folder.name
     about = {"name": model, "revision": taken, "torch": str(torch.__version__)}
     description = folder / "pipeline.json"
     if description.is_file():
         about["pipeline_sha256"] = file_digest(description)
     return Session(pipeline, torch, about, device)
+
+
+def _fetched(model: str, revision: str | None) -> Path:
+    from huggingface_hub import snapshot_download
+
+    return Path(snapshot_download(model, revision=revision))
 
 
 def list_extractions(
@@ -239,11 +248,13 @@ def _extract(session: Session, extraction: Extraction, preprocess: bool) -> Extr
         raise InputError(
             extraction.image, "gave latents that are not finite", "another seed or image"
         )
-    with staged(extraction.slat) as path, path.open("wb") as stream:
-        np.savez(stream, coords=coords, feats=feats)
-    record["slat"] = {"voxels": len(coords), "sha256": file_digest(extraction.slat)}
-    with staged(extraction.record) as path:
-        path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    with staged(extraction.slat) as path:
+        with path.open("wb") as stream:
+            np.savez(stream, coords=coords, feats=feats)
+        record["slat"] = {"voxels": len(coords), "sha256": file_digest(path)}
+        # The record comes first: without it, a run that goes on would refuse the SLAT.
+        with staged(extraction.record) as about:
+            about.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return Extracted(len(coords), kept=False, seconds=seconds)
 
 
@@ -273,12 +284,12 @@ def _asked_for(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read_image(path: Path) -> tuple[bytes, Image]:
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         data = path.read_bytes()
         image = Image.open(io.BytesIO(data))
         image.load()
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError, SyntaxError) as error:
+    except Exception as error:  # Pillow's formats raise errors of any type.
         raise InputError(path, f"cannot be read ({error})", "an image, such as a PNG") from None
     return data, image

@@ -137,7 +137,10 @@ def extract(
     seeds: list[int],
     about: dict[str, Any],
 ) -> int:
-    """Write the latents of each image and seed; return how many failed. Existing files stay."""
+    """Write the latents of each image and seed; return how many failed.
+
+    Existing files stay; one that is not of this image, seed and `about` counts as failed.
+    """
     from PIL import Image
 
     failed = 0
@@ -145,18 +148,22 @@ def extract(
         for seed in seeds:
             name = path.stem if len(seeds) == 1 else f"{path.stem}/seed-{seed}"
             slat = out / (name + ".npz")
-            if slat.exists():
-                print(f"{slat}: is there already", file=sys.stderr)
-                continue
             try:
                 data = path.read_bytes()
+                image_of = {"name": path.name, "sha256": hashlib.sha256(data).hexdigest()}
+                asked = {"image": image_of, "seed": seed, **about}
+                if slat.exists():
+                    before = json.loads(slat.with_suffix(".json").read_text("utf-8"))
+                    if asked != {key: before.get(key) for key in asked}:
+                        raise ValueError(f"{slat} is of another image, seed or model; move it away")
+                    print(f"{slat}: is there already", file=sys.stderr)
+                    continue
                 with Image.open(path) as image, redirect_stdout(sys.stderr):
                     image.load()
                     coords, feats, seconds = sample(image, seed)
                 if len(coords) == 0 or not np.isfinite(feats).all():
                     raise ValueError("no voxels, or latents that are not finite")
-            except (OSError, ValueError, IndexError, RuntimeError) as error:
-                # ValueError: no foreground; RuntimeError: no memory left. The others go on.
+            except Exception as error:  # No foreground, no memory left, ...: the others go on.
                 print(f"{path}: {type(error).__name__}: {error}", file=sys.stderr)
                 failed += 1
                 continue
@@ -167,9 +174,7 @@ def extract(
             record = {
                 "format": FORMAT,
                 "format_version": 1,
-                "image": {"name": path.name, "sha256": hashlib.sha256(data).hexdigest()},
-                "seed": seed,
-                **about,
+                **asked,
                 "slat": {
                     "voxels": len(coords),
                     "sha256": hashlib.sha256(part.read_bytes()).hexdigest(),
@@ -233,6 +238,7 @@ def main(words: list[str] | None = None) -> int:
         "generator": options.generator,
         "model": {"name": options.model or MODELS.get(options.generator, "")},
         "preprocessed": not options.no_preprocess,
+        **({"pipeline": options.pipeline} if options.generator == "trellis2" else {}),
     }
     sample = load(options)
     return 1 if extract(sample, options.images, options.out, options.seed or [42], about) else 0

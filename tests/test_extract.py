@@ -14,7 +14,7 @@ from unittest.mock import Mock, call
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, PngImagePlugin
 from support import commands
 from support.synthetic import make_asset
 
@@ -145,6 +145,20 @@ def test_names(tmp_path):
         work.list_extractions([tmp_path / ".hidden.png"], tmp_path, [1], False)
 
 
+def test_a_run_that_stopped_before_its_latents_were_there_goes_on(session, images, tmp_path):
+    run(session, images[:1], tmp_path / "slat", 3)
+    (tmp_path / "slat" / "cup.npz").unlink()  # The record is written first.
+    [result] = run(session, images[:1], tmp_path / "slat", 3)
+    assert not result.kept and (tmp_path / "slat" / "cup.npz").is_file()
+
+
+def with_text_chunk(path: Path, size: int) -> None:
+    """Write a PNG whose text is longer than Pillow takes, for which it raises ValueError."""
+    about = PngImagePlugin.PngInfo()
+    about.add_text("note", "a" * size, zip=True)
+    Image.new("RGB", (2, 2)).save(path, pnginfo=about)
+
+
 class Strict(Pipeline):
     """Prints, and finds the box of the foreground as TRELLIS's `preprocess_image` does."""
 
@@ -170,7 +184,7 @@ class Full(Pipeline):
 ])  # fmt: skip
 def test_a_bad_image_does_not_stop_the_others(kind, said, images, tmp_path, capsys):
     if kind is Pipeline:
-        images[0].write_bytes(b"no image")
+        with_text_chunk(images[0], 2**21)
     bad, good = run(work.Session(kind(), torch, {}), images, tmp_path / "slat", 0)
     assert isinstance(bad, InputError) and f"cup.png: {said}" in str(bad) and good.voxels > 0
     assert [path.name for path in (tmp_path / "slat").glob("*.npz")] == ["bear.npz"]
@@ -226,6 +240,20 @@ def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatc
     assert pipeline.device == torch.device(device) and "cropped" not in pipeline.seen
 
 
+@pytest.mark.parametrize("error", [OSError("401 gated"), KeyError("x"), ValueError("a/b/c")])
+def test_a_model_that_cannot_be_loaded_is_told(error, images, tmp_path, monkeypatch):
+    loader = SimpleNamespace(from_pretrained=Mock(side_effect=error))
+    fake = SimpleNamespace(TrellisImageTo3DPipeline=loader)
+    monkeypatch.setitem(sys.modules, "trellis", ModuleType("trellis"))
+    monkeypatch.setitem(sys.modules, "trellis.pipelines", fake)
+    hub = SimpleNamespace(snapshot_download=lambda name, revision: str(tmp_path))
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    words = ("--model", "no/such", "--out", tmp_path / "o")
+    told = commands.refused("extract-slat", images[0], *words)
+    assert len(told.splitlines()) == 1
+    assert f"the model no/such cannot be loaded ({type(error).__name__}: {error})" in told
+
+
 SOURCE = Path(trellis_latents.__file__)
 
 
@@ -278,6 +306,10 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(images, tmp_pa
         for name in ("coords", "feats"):
             np.testing.assert_array_equal(one[name], two[name])
             assert one[name].dtype == two[name].dtype
+    assert trellis_latents.main(words) == 1  # The bear is kept.
+    calls = len(pipeline.seen)
+    assert trellis_latents.main([*words[1:-1], "8"]) == 1  # It is of another seed.
+    assert len(pipeline.seen) == calls
     record = json.loads((tmp_path / "slat" / "bear.json").read_text())
     assert record["seed"] == 7 and record["model"]["name"] == "microsoft/TRELLIS-image-large"
     grid = tmp_path / "pixieverse" / "bear" / "sample_0" / "material_grid.npy"

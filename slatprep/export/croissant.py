@@ -52,6 +52,14 @@ ZARR = "https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html"
 """The format of Zarr's files; no media type is registered for it."""
 
 
+_FORMS = {
+    "url": (r"https?://\S+", "a page such as https://example.org/data"),
+    "license": (r"https?://\S+|[\w.+-]+", "an SPDX identifier such as CC-BY-4.0, or a URL"),
+    "version": (r"\d+\.\d+\.\d+([-+]\S+)?", "three numbers such as 1.0.0"),
+}
+"""What stated texts must look like."""
+
+
 @dataclass(frozen=True)
 class Stated:
     """Metadata of a dataset that its store does not hold; empty if not known.
@@ -74,10 +82,10 @@ class Stated:
     date_published: str = ""
 
     def __post_init__(self) -> None:
-        if self.url and not re.fullmatch(r"https?://\S+", self.url):
-            raise ConfigError(
-                f"url is {self.url!r}; expected a page such as https://example.org/data"
-            )
+        for name, (form, expected) in _FORMS.items():
+            text = getattr(self, name)
+            if text and not re.fullmatch(form, text):
+                raise ConfigError(f"{name} is {text!r}; expected {expected}")
         if self.date_published and not _is_day(self.date_published):
             raise ConfigError(
                 f"date_published is {self.date_published!r}; expected a day such as 2026-01-31"

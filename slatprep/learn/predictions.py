@@ -380,12 +380,17 @@ def _zarr(root: Path, asset_id: str) -> Mapping[str, NDArray[Any]] | None:
 
     def fetch(name: str, key: str, most: int) -> bytes:
         if not (path := group / name / key).exists():
-            # zarr leaves out chunks of fill values, and a lost chunk must not pass as one.
-            raise InputError(f"{group} [{name}]", f"its file {name}/{key} is missing", _WHOLE)
+            missing(name, key)
         return read_bounded(storage_of(root).locate(path)[0], most)
 
+    def missing(name: str, key: str) -> None:
+        # zarr leaves out chunks of fill values, and a lost chunk must not pass as one.
+        raise InputError(f"{group} [{name}]", f"its file {name}/{key} is missing", _WHOLE)
+
     arrays = {
-        name: zarr_array(partial(fetch, name), f"{group} [{name}]", spec, _WHOLE)
+        name: zarr_array(
+            partial(fetch, name), f"{group} [{name}]", spec, _WHOLE, partial(missing, name)
+        )
         for name, spec in _SPECS.items()
         if (group / name).is_dir()
     }

@@ -58,8 +58,7 @@ class SourceAdapter(Protocol):
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Yield the fields of a source; this default finds them by their names alone."""
-        chosen = {"sample": source.sample} if source.sample else {}
-        return find_by_pattern(patterns_of(self, source), listing, chosen)
+        return find_by_pattern(patterns_of(self, source), listing, chosen_sample(source))
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read the field at ``pair.grid`` in SI units; raise `InputError` if that fails."""
@@ -156,12 +155,18 @@ def patterns_of(adapter: SourceAdapter, source: PixieverseSource) -> Sequence[st
     return source.grid if source.grid != PixieverseSource.grid else adapter.patterns
 
 
-def find_by_pattern(
-    patterns: Sequence[str], listing: Listing, known: Mapping[str, str]
-) -> Iterator[FoundField]:
-    """Yield the fields whose names match; for an object, only those of its first matching pattern.
+def chosen_sample(source: PixieverseSource) -> dict[str, str]:
+    """Return the field of patterns that the dataset definition fixes, if it chooses a sample."""
+    return {"sample": source.sample} if source.sample else {}
 
-    Raises ConfigError if a pattern has no ``{id}``.
+
+def find_by_pattern(
+    patterns: Sequence[str], listing: Listing, known: Mapping[str, str], first: bool = True
+) -> Iterator[FoundField]:
+    """Yield the fields whose names match.
+
+    If `first`, yield only those of an object's first matching pattern. Raises ConfigError if a
+    pattern has no ``{id}``.
     """
     done: dict[str, object] = {}
     for pattern in patterns:
@@ -169,7 +174,9 @@ def find_by_pattern(
             raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
         found = [
             FoundField(fields.get("id", path), path, fields.get("sample", ""), problem)
-            for fields, path, problem in find_files(listing, pattern, known, skip=done)
+            for fields, path, problem in find_files(
+                listing, pattern, known, skip=done if first else {}
+            )
         ]
         done |= dict.fromkeys(one.object_id for one in found)
         yield from found

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+import re
 import sys
 import tokenize
 import zipfile
@@ -89,7 +90,7 @@ class ArraySpec:
 
     In a shape, None stands for 0 to `max_rows` rows, and a range for any size in it. Without
     `shapes`, any shape of 1 to `max_items` values is allowed. An error adds `note` to the allowed
-    shapes.
+    shapes. A file may state the `units` of the values, any of these; none of them allows any.
     """
 
     shapes: tuple[tuple[int | range | None, ...], ...]
@@ -97,6 +98,7 @@ class ArraySpec:
     max_items: int = 64
     note: str = ""
     max_rows: int = RESOLUTION**3
+    units: tuple[str, ...] = ()
 
     def check(self, where: str | Place, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         """Raise InputError, naming `where`, unless shape and dtype are allowed."""
@@ -114,11 +116,41 @@ class ArraySpec:
             fault = f"has shape {_shape_text(shape)}"
             raise InputError(where, fault, f"1 to {self.max_items} values")
 
+    def check_attributes(
+        self, where: str | Place, attributes: Mapping[str, Any], values: NDArray[Any]
+    ) -> None:
+        """Raise InputError if attributes of the CF conventions give the values another meaning."""
+        for name, plain in (("scale_factor", 1), ("add_offset", 0)):
+            if np.any(np.asarray(attributes.get(name, plain)) != plain):
+                fault = f"its values are packed, by {name} {attributes[name]}"
+                raise InputError(where, fault, "the values themselves, and no such attribute")
+        for name in ("_FillValue", "missing_value"):
+            fill = np.asarray(attributes.get(name, np.nan))
+            if fill.dtype.kind in "fiu" and np.isin(values, fill).any():
+                fault = f"{name} {fill} marks values as missing"
+                raise InputError(where, fault, "rows of voxels that have all values")
+        said = attributes.get("units", "")
+        said = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+        if self.units and _factors(said) not in [{}, *map(_factors, self.units)]:
+            fault = f"its attribute units says {said!r}"
+            raise InputError(where, fault, f"values in {self.units[0]}, and no other unit")
+
     def _fits(self, shape: tuple[int, ...], allowed: tuple[int | range | None, ...]) -> bool:
         return len(shape) == len(allowed) and all(
             0 <= n <= self.max_rows if m is None else n in m if isinstance(m, range) else n == m
             for n, m in zip(shape, allowed, strict=True)
         )
+
+
+def _factors(unit: str) -> dict[str, int]:
+    """Return the exponent of each part of a unit, however it is written: ``kg/m^3``, ``kg m-3``."""
+    plain = unit.translate(str.maketrans("²³⁻", "23-"))
+    parts = re.findall(r"(/?)\s*([^\W\d_]+)\s*(?:\^|\*\*)?\s*(-?\d*)", plain)
+    return {
+        name: int(power or 1) * (-1 if over else 1)
+        for over, name, power in parts
+        if name not in ("dimensionless", "none")
+    }
 
 
 def _shape_text(shape: tuple[int | range | None, ...], most: int = 0) -> str:
@@ -246,9 +278,13 @@ def npz_arrays(
 
 
 def zarr_array(
-    fetch: Callable[[str, int], bytes | None], where: str | Place, spec: ArraySpec, expected: str
+    fetch: Callable[[str, int], bytes | None],
+    where: str | Place,
+    spec: ArraySpec,
+    expected: str,
+    missing: Callable[[str], None] = lambda _: None,
 ) -> NDArray[Any]:
-    """Read an array of Zarr format 3, with `fetch` of `slatprep.storage.chunks.read_chunks`.
+    """Read an array of Zarr format 3; see `slatprep.storage.chunks.read_chunks`.
 
     InputError, naming `where` and what is expected, if it is damaged or not as specified.
     """
@@ -256,9 +292,11 @@ def zarr_array(
         metadata = parse_document(fetch("zarr.json", _MAX_METADATA_BYTES) or b"")
         spec.check(where, *array_form(metadata))
         try:
-            return read_chunks(metadata, fetch)
+            array = read_chunks(metadata, fetch, missing)
         except StoreError as error:
             raise ValueError(str(error)) from None
+        spec.check_attributes(where, metadata.get("attributes") or {}, array)
+    return array
 
 
 def npz_small_arrays(

@@ -34,6 +34,7 @@ SUFFIXES = (".h5", ".hdf5")
 
 _DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3
 _FILTER_NAMES = {_DEFLATE: "gzip", _SHUFFLE: "shuffle", _FLETCHER32: "fletcher32"}
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _UNREADABLE = "is no readable HDF5 file"
 _EXPECTED = "an intact HDF5 file with datasets {}; copy or make it again"
 _WRITTEN = "a completely written dataset; make it again"
@@ -47,8 +48,9 @@ def hdf5_arrays(
     """Read the named datasets of an HDF5 file; errors call it `where`, see `group_arrays`."""
     import h5py
 
+    begins = ": it begins as one, and may be cut off" if data.startswith(_SIGNATURE) else ""
     with (
-        refusing(where, _UNREADABLE, _EXPECTED.format(", ".join(specs))),
+        refusing(where, f"{_UNREADABLE}{begins}", _EXPECTED.format(", ".join(specs))),
         h5py.File(h5py.h5f.open_file_image(data)) as file,
     ):
         return group_arrays(file, where, "", specs)
@@ -160,23 +162,33 @@ def _child(parent: h5py.Group, name: str, where: str, kind: type, names: Iterabl
 
 
 def _read_dataset(dataset: h5py.Dataset, where: str, spec: ArraySpec) -> NDArray[Any]:
+    import h5py
+
     expected = "a dataset whose values lie in the file"
     if dataset.shape is None:
         raise InputError(where, "has no values", expected)
+    if dataset.dtype.hasobject:
+        raise InputError(where, "is text", "numbers")
     spec.check(where, dataset.shape, dataset.dtype)
+    if h5py.check_enum_dtype(dataset.dtype) is not None:
+        raise InputError(where, "is an enumeration, with names of its own", "plain integers")
+    if not dataset.id.get_type().equal(h5py.h5t.py_create(dataset.dtype)):
+        raise InputError(where, "stores a number format of its own", "IEEE floats or integers")
     if dataset.is_virtual:
         raise InputError(where, "is a virtual dataset, which reads other files", expected)
     if dataset.id.get_create_plist().get_external_count():
         raise InputError(where, "keeps its values in another file", expected)
     if dataset.chunks is not None:
-        return _read_chunks(dataset, where)
-    stored = dataset.id.get_storage_size()
-    wanted = math.prod(dataset.shape) * dataset.dtype.itemsize
-    if stored != wanted:
-        # HDF5 reads missing chunks as zeros, which would pass as values.
-        raise InputError(where, f"holds {stored} of {wanted} bytes", _WRITTEN)
-    array: NDArray[Any] = dataset[()]
-    return array.astype(array.dtype.newbyteorder("="), copy=False)
+        array = _read_chunks(dataset, where)
+    else:
+        stored = dataset.id.get_storage_size()
+        wanted = math.prod(dataset.shape) * dataset.dtype.itemsize
+        if stored != wanted:
+            # HDF5 reads missing chunks as zeros, which would pass as values.
+            raise InputError(where, f"holds {stored} of {wanted} bytes", _WRITTEN)
+        array = dataset[()].astype(dataset.dtype.newbyteorder("="), copy=False)
+    spec.check_attributes(where, dataset.attrs, array)
+    return array
 
 
 def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
@@ -185,8 +197,6 @@ def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
     This module undoes the filters: HDF5's own pipeline inflates without bound, and some damaged
     chunks crash it.
     """
-    import h5py
-
     properties = dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
     if set(filters) - _FILTER_NAMES.keys() or len(set(filters)) < len(filters):
@@ -194,8 +204,6 @@ def _read_chunks(dataset: h5py.Dataset, where: str) -> NDArray[Any]:
         way = "h5repack -f GZIP=1 rewrites a file"
         raise InputError(where, f"uses HDF5 filters {filters}", f"{known}; {way}")
     dtype, steps = dataset.dtype, dataset.chunks
-    if not dataset.id.get_type().equal(h5py.h5t.py_create(dtype)):
-        raise InputError(where, "stores a number format of its own", "IEEE floats or integers")
     chunk_bytes = math.prod(steps) * dtype.itemsize
     offsets = [range(0, n, step) for n, step in zip(dataset.shape, steps, strict=True)]
     wanted = math.prod(map(len, offsets))
@@ -230,7 +238,10 @@ def _undo(filters: list[int], data: bytes, chunk_bytes: int, itemsize: int) -> b
 
     for code in reversed(filters):
         if code == _DEFLATE:
-            data = zlib.decompressobj().decompress(data, chunk_bytes + 5)
+            try:
+                data = zlib.decompressobj().decompress(data, chunk_bytes + 5)
+            except zlib.error:
+                return b""
         elif code == _FLETCHER32 and len(data) > 4:
             data = bytes(Fletcher32().decode(data))
         elif code == _SHUFFLE and len(data) % itemsize == 0:

@@ -59,8 +59,12 @@ def field_of_voxels(
     given = np.zeros(count, np.int64) if material is None else np.asarray(material)
     with np.errstate(invalid="ignore"):
         own = given.astype(np.int64)
-    if given.shape != (count,) or ((own < 0) | (own >= classes) | (own != given)).any():
-        raise InputError(where, "has classes that are none", f"{count} of 0..{classes - 1}")
+    if given.shape != (count,):
+        raise InputError(where, f"has material {given.shape}", f"({count},)")
+    if (unknown := (own < 0) | (own >= classes) | (own != given)).any():
+        row = int(np.argmax(unknown))
+        expected = f"classes 0 to {classes - 1}, and no row for a voxel without one"
+        raise InputError(where, f"has class {given[row]:g} in row {row}", expected)
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):

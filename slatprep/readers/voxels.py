@@ -26,7 +26,14 @@ from slatprep import records
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import PixieverseSource
 from slatprep.readers import files
-from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
+from slatprep.readers.adapters import (
+    FoundField,
+    Holding,
+    SourceAdapter,
+    chosen_sample,
+    find_by_pattern,
+    patterns_of,
+)
 from slatprep.readers.hdf5 import SUFFIXES, hdf5_arrays
 from slatprep.readers.points import ply_points
 from slatprep.readers.voxel_sets import MAX_RESOLUTION, field_of_voxels
@@ -105,7 +112,9 @@ class PlainVoxels(SourceAdapter):
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[FoundField]:
         """Find the fields by the names of their files."""
-        for found in super().find(source, listing):
+        # Unlike a grid and a prediction, two forms of an object are equal, and none precedes.
+        patterns, chosen = patterns_of(self, source), chosen_sample(source)
+        for found in find_by_pattern(patterns, listing, chosen, first=False):
             path = found.path.removesuffix(_GROUP)
             yield replace(found, path=path, beside=(DESCRIPTION,))
 
@@ -115,7 +124,10 @@ class PlainVoxels(SourceAdapter):
         root = pair.roots.pixieverse
         text, about = files.load_source(root / DESCRIPTION, root, "description")
         said = _parsed(text, str(root / DESCRIPTION))
-        specs = {"voxels": _VOXELS, **{one.name: _COLUMN for one in said.properties}}
+        specs = {"voxels": _VOXELS}
+        for one in said.properties:
+            stated = filter(None, (one.unit, pair.roots.units.of(one.name)))
+            specs[one.name] = replace(_COLUMN, units=tuple(stated))
         specs |= {"material": _COLUMN} if said.classes else {}
         data, file = files.load_source(path, root, "grid")
         kind = path.suffix.lower()
@@ -221,19 +233,22 @@ def _group_arrays(
         def fetch(name: str, key: str, most: int) -> bytes | None:
             path = f"{name}/{key}"
             if path not in there:
-                if name in empty:
-                    return None
-                fault = f"its chunk {path} is missing"
-                raise InputError(f"{where} [{name}]", fault, _ALL_CHUNKS.format(name))
+                return None
             if archive.getinfo(path).file_size > most:
                 raise ValueError(f"{key} has {archive.getinfo(path).file_size} bytes")
             return archive.read(path)
+
+        def missing(name: str, key: str) -> None:
+            if name not in empty:
+                fault = f"its chunk {name}/{key} is missing"
+                raise InputError(f"{where} [{name}]", fault, _ALL_CHUNKS.format(name))
 
         for name, spec in specs.items():
             here = f"{where} [{name}]"
             if f"{name}/zarr.json" not in there:
                 raise InputError(here, "is not in it", expected)
-            arrays[name] = files.zarr_array(partial(fetch, name), here, spec, expected)
+            lacks = partial(missing, name)
+            arrays[name] = files.zarr_array(partial(fetch, name), here, spec, expected, lacks)
     return arrays
 
 

@@ -61,7 +61,9 @@ class ChunkDecoder:
         text = max_text if dtype.hasobject else 0
         first, rest = codecs[0], [codec["name"] for codec in codecs[1:]]
         little = first.get("configuration", {}).get("endian", "little") == "little"
-        if first["name"] == ("vlen-utf8" if text else "bytes") and little:
+        if not little:
+            raise ValueError("it is big-endian")
+        if first["name"] == ("vlen-utf8" if text else "bytes"):
             crc32c = rest[-1:] == ["crc32c"]
             compressors = rest[:-1] if crc32c else rest
             if compressors in ([], ["blosc"], ["zstd"]):
@@ -214,14 +216,16 @@ def inner_chunks(
 
 
 def read_chunks(
-    metadata: Mapping[str, Any], fetch: Callable[[str, int], bytes | None]
+    metadata: Mapping[str, Any],
+    fetch: Callable[[str, int], bytes | None],
+    missing: Callable[[str], None],
 ) -> NDArray[Any]:
     """Read an array of chunks, each in a file of its own or in a shard.
 
     `metadata` is its ``zarr.json``, whose shape the caller has checked. `fetch` takes the name of a
     file, such as ``c/0/1``, and the largest number of bytes; it returns the bytes, or None without
-    such a file. StoreError, ValueError or KeyError if the metadata are invalid, or a chunk
-    contradicts them.
+    such a file. `missing` is told each chunk that was never written, and may refuse it.
+    StoreError, ValueError or KeyError if the metadata are invalid, or a chunk contradicts them.
     """
     shape, native = array_form(metadata)
     steps = whole_sizes(metadata["chunk_grid"]["configuration"]["chunk_shape"])
@@ -246,12 +250,18 @@ def read_chunks(
     most = min(each * (decoder.nbytes + 65_536), 2 * MAX_CHUNK_BYTES)
     for corner in product(*corners):
         places = (start // step for start, step in zip(corner, steps, strict=True))
-        data = fetch(separator.join(["c", *map(str, places)]), most)
+        key = separator.join(["c", *map(str, places)])
+        data = fetch(key, most)
         if data is None:
-            continue  # Zarr writes no file of fill values alone.
+            missing(key)  # Zarr writes no file of fill values alone.
+            continue
         for part, packed in zip(product(*parts), _packed(data, each, sharded), strict=True):
             start = tuple(map(add, corner, part))
-            if packed is not None and all(map(lt, start, shape)):
+            if not all(map(lt, start, shape)):
+                continue
+            if packed is None:
+                missing(f"{key} from {list(start)}")
+            else:
                 decoder.decode(packed, block)
                 place_chunk(array, start, block)
     return array

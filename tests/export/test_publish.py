@@ -138,6 +138,8 @@ def test_no_category_is_a_control_character_or_the_row_of_all(copy):
     (("--date-published", "20260131"), "expected a day such as 2026-01-31"),
     (("--url", "my page"), "url is 'my page'; expected"),
     (("--url", "ftp:"), "expected a page such as https://example.org/data"),
+    (("--license", "foo bar"), "license is 'foo bar'; expected an SPDX identifier"),
+    (("--dataset-version", "1.x"), "version is '1.x'; expected three numbers"),
 ])  # fmt: skip
 def test_what_is_stated_is_what_it_says(words, said, store, tmp_path):
     assert said in run(store, "--out", tmp_path / "hub", *words, code=2).stderr

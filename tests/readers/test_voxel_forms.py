@@ -2,11 +2,13 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numcodecs
 import numpy as np
 import pytest
@@ -225,7 +227,7 @@ def test_a_class_that_the_table_does_not_have_is_refused(root):
         rows = rows_of(10)
         rows["material"] = np.full(10, material, np.float32)
         sources.write_voxels(root, "a", "npz", rows)
-        refused(root, r"has classes that are none; expected 10 of 0\.\.2")
+        refused(root, rf"has class {material:g} in row 0; expected classes 0 to 2, and no row")
 
 
 def edit(change: Callable[[str], str]) -> Callable[[Path], object]:
@@ -248,6 +250,7 @@ def test_arrays_in_shards_are_read_as_others_are(root):
     plain = field_at(root)
     for name in ("voxels", "density", "material"):
         in_shards(root / "a.zarr" / name)
+    assert sorted(one.name for one in (root / "a.zarr" / "density" / "c").iterdir()) == ["0", "1"]
     sharded = field_at(root)
     assert sharded.sources != plain.sources
     for name in ("voxels", "properties", "material"):
@@ -259,6 +262,12 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "torn shard": (lambda a: (in_shards(a), os.truncate(a / "c/0", 500)), "no sound index"),
     "changed shard": (lambda a: (in_shards(a), (a / "c/0").open("r+b").write(b"torn")),
                       "cannot be unpacked|it holds"),
+    "half a shard": (
+        lambda a: zarr.create_array(a, shape=(3000,), dtype="f4", chunks=(100,), shards=(3000,),
+                                    overwrite=True).__setitem__(slice(1500), 900.0),
+        r"its chunk density/c/0 from \[1500\] is missing; expected all chunks"),
+    "big end": (lambda a: written_anew(a, serializer=zarr.codecs.BytesCodec(endian="big")),
+                "is big-endian"),
     "version 2": (lambda a: written_anew(a, zarr_format=2), "is not in it"),
     "codec": (edit(lambda t: t.replace('"zstd"', '"numcodecs.pickle"')), "numcodecs.pickle"),
     "rows": (edit(lambda t: json.dumps(json.loads(t) | {"shape": [2**40]})), "N <= 2097152"),
@@ -275,6 +284,73 @@ def test_zarr_that_cannot_be_read_is_said(root, how):
     damage, said = DAMAGES[how]
     damage(root / "a.zarr" / "density")
     refused(root, rf"a\.zarr \[density\].*({said})")
+
+
+@pytest.mark.parametrize("form", ["hdf5", "zarr"])
+@pytest.mark.parametrize(("attribute", "value", "said"), [
+    ("scale_factor", 0.5, "its values are packed, by scale_factor 0.5"),
+    ("add_offset", 100, "its values are packed, by add_offset 100"),
+    ("_FillValue", 2500.0, "_FillValue 2500.0 marks values as missing"),
+    ("missing_value", 2500, "missing_value 2500 marks values as missing"),
+    ("units", "g/cm^3", "its attribute units says 'g/cm^3'; expected values in kg/m^3"),
+    ("units", "kg m-2", "its attribute units says 'kg m-2'"),
+    ("units", "kg m-3", ""),
+    ("units", "kg·m⁻³", ""),
+    ("units", "kg / m**3", ""),
+    ("units", "", ""),
+    ("scale_factor", 1.0, ""),
+    ("_FillValue", -1.0, ""),
+    ("long_name", "mass over volume", ""),
+])  # fmt: skip
+def test_attributes_that_give_values_another_meaning_are_heeded(root, form, attribute, value, said):
+    rows = rows_of(100)
+    rows["density"][7] = 2500.0
+    sources.write_voxels(root, "a", form, rows)
+    if form == "hdf5":
+        with h5py.File(root / "a.h5", "a") as file:
+            file["density"].attrs[attribute] = value
+    else:
+        zarr.open_array(root / "a.zarr" / "density").attrs[attribute] = value
+    if said:
+        refused(root, rf"\[density\]: {re.escape(said)}")
+    else:
+        assert (field_at(root).properties[:, 0] == 2500.0).sum() == 1
+
+
+@pytest.mark.parametrize(("column", "said"), [
+    (lambda column: column.astype(h5py.enum_dtype({"steel": 0, "wood": 1})), "is an enumeration"),
+    (lambda column: column.astype("O").astype(str).astype(object), "is text; expected numbers"),
+])  # fmt: skip
+def test_classes_by_names_in_hdf5_are_refused(root, column, said):
+    rows = rows_of(100)
+    rows["material"] %= 2
+    sources.write_voxels(root, "a", "hdf5", rows)
+    with h5py.File(root / "a.h5", "a") as file:
+        del file["material"]
+        file["material"] = column(rows["material"])
+    refused(root, rf"a\.h5 \[material\]: {said}")
+
+
+def test_hdf5_that_is_cut_off_or_damaged_is_told_as_that(root):
+    rows = rows_of(3000)
+    sources.write_voxels(root, "a", "hdf5", rows)
+    with h5py.File(root / "a.h5", "a") as file:
+        del file["density"]
+        file.create_dataset("density", data=rows["density"], chunks=(500,), compression="gzip")
+        at = file["density"].id.get_chunk_info(2).byte_offset
+    whole = (root / "a.h5").read_bytes()
+    (root / "a.h5").write_bytes(whole[:at] + bytes(8) + whole[at + 8 :])
+    refused(root, r"a\.h5 \[density\]: the chunk at \(1000,\) is damaged")
+    (root / "a.h5").write_bytes(whole[: len(whole) // 2])
+    refused(root, r"a\.h5: is no readable HDF5 file: it begins as one, and may be cut off")
+
+
+def test_two_forms_of_one_object_are_refused(root):
+    for form in ("npz", "hdf5"):
+        sources.write_voxels(root, "a", form, rows_of(100))
+    source = PixieverseSource(root=root, adapter="voxels")
+    assert {one.path for one in find_grids(source)["a"]} == {"a.npz", "a.h5"}
+    refused(root, r"2 grids for one id 'a' \(a\.h5, a\.npz\)")
 
 
 @pytest.mark.parametrize("name", ["voxels", "material", "density", "damping"])
