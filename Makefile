@@ -80,7 +80,8 @@ $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(INSTALLED)
 # -- development ------------------------------------------------------------
 
 LINT  = $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/lint-imports && \
-        $(BIN)/deptry slatprep && $(BIN)/mypy && $(BIN)/python tools/budget.py && \
+        $(BIN)/deptry slatprep && $(BIN)/mypy && \
+        $(BIN)/mypy --config-file benchmarks/mypy.ini && $(BIN)/python tools/budget.py && \
         $(BIN)/python tools/prose.py
 DOCS  = NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir $(SITE)
 WHEEL = sh tools/try-wheel.sh $(BIN)/python dist

@@ -36,7 +36,7 @@ import zarr
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
 from slatprep.parameters.files import load_parameters
-from slatprep.pipeline import annotate, publish
+from slatprep.pipeline import annotate, destination
 from slatprep.pipeline import asset as process
 from slatprep.pipeline import dataset as build
 from slatprep.readers import discover
@@ -82,7 +82,7 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
         process.process_asset(pair, parameters)
     steps: dict[str, float] = defaultdict(float)
     rooms = {
-        **STEPS, "finish_asset": process, "pack_store": build, "replace_directory": publish
+        **STEPS, "finish_asset": process, "pack_store": build, "replace_directory": destination
     }  # fmt: skip
     for name, room in rooms.items():
         setattr(room, name, timed(getattr(room, name), steps, name))
@@ -131,17 +131,17 @@ def measure(parameters: BuildParameters, folder: Path, jobs: bool) -> dict[str, 
 
 def repeated(parameters: BuildParameters, folder: Path, times: int) -> BuildParameters:
     """Link the files of each asset under so many ids; return the dataset of all."""
-    sides = {"pixieverse": parameters.pixieverse, "slat": parameters.slat}
+    sides: dict[str, Any] = {"pixieverse": parameters.pixieverse, "slat": parameters.slat}
     for pair in discover(parameters):
         for side, file in (("pixieverse", pair.grid), ("pixieverse", pair.mask),
                            ("pixieverse", pair.bounds), ("slat", pair.slat)):  # fmt: skip
             if file is None:
                 continue
-            name = Path(file).relative_to(Path(sides[side].root).absolute()).as_posix()
+            name = Path(str(file)).relative_to(Path(sides[side].root).absolute()).as_posix()
             for number in range(times):
                 link = folder / side / name.replace(pair.object_id, f"{pair.object_id}-{number}")
                 link.parent.mkdir(parents=True, exist_ok=True)
-                os.link(file, link)
+                os.link(str(file), link)
     own = {side: replace(source, root=folder / side) for side, source in sides.items()}
     return replace(parameters, pairing=PairingParameters(), **own)
 

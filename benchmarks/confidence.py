@@ -279,7 +279,7 @@ def _row(kind: str, asset: Asset, owner: Asset, alignment: Alignment) -> Row:
     latents, truth = owner[2], owner[3]
     annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
     around = surroundings_of(field, latents, alignment, annotation)
-    ambiguity = measure_ambiguity(field, latents, alignment, annotation, SampleParameters())
+    ambiguity = measure_ambiguity(field, latents, alignment, SampleParameters())
     score = compare_with_truth(asset_id, truth, field, latents, annotation)
     valid = np.flatnonzero(annotation.valid)
     chosen = valid[np.linspace(0, len(valid) - 1, min(VOXELS, len(valid))).astype(np.intp)]

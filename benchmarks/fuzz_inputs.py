@@ -107,7 +107,8 @@ def check_pairs(parameters: BuildParameters) -> None:
         before = pair.asset_id
         require(re.fullmatch(r"[A-Za-z0-9._%-]+", pair.asset_id) is not None, "an id that is none")
         require(isinstance(pair.category, str), "a category that is no text")
-        for path in (pair.grid, pair.mask, pair.slat):
+        for place in (pair.grid, pair.mask, pair.slat):
+            path = None if place is None else Path(str(place))
             inside = path is None or path.is_relative_to(parameters.pixieverse.root.parent)
             require(inside and ".." not in (path.parts if path else ()), "a path out of its root")
 
@@ -273,7 +274,7 @@ def fuzz_builds(assets: int, seed: int, folder: Path) -> dict[str, object]:
             if number % 4 == 0:
                 continue
             rng = np.random.default_rng((seed, 1, first + number))
-            kinds = [path for path in (pair.grid, pair.mask, pair.slat) if path]
+            kinds = [Path(str(path)) for path in (pair.grid, pair.mask, pair.slat) if path]
             file = target / kinds[rng.integers(len(kinds))].relative_to(demo)
             slat = file.suffix == ".npz" and rng.random() < 0.7
             data = file.read_bytes()

@@ -37,6 +37,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from engines import pairs_with_truth
@@ -225,7 +226,8 @@ def main() -> None:
     way.add_argument("store", type=Path)
     way.add_argument("--shares", type=float, nargs=3, default=(0.8, 0.1, 0.1))
     given = vars(parser.parse_args())
-    {"lookup": lookup, "witness": witness, "bound": bound}[given.pop("question")](**given)
+    ways: dict[str, Any] = {"lookup": lookup, "witness": witness, "bound": bound}
+    ways[given.pop("question")](**given)
 
 
 if __name__ == "__main__":

@@ -95,7 +95,7 @@ def repeat_store(source: Path, folder: Path, assets: int, noise: float) -> tuple
                 values += rng.normal(scale=noise, size=values.shape).astype(np.float32)
                 np.clip(values, -1, 1, out=values)
             root[name][:] = values
-    manifests = manifests_of(path)
+    manifests = Path(str(manifests_of(path)))
     manifests.mkdir()
     shutil.copy(known / "build.json", manifests)
     with (known / "assets.jsonl").open(encoding="utf-8") as lines:
