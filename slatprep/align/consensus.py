@@ -10,6 +10,7 @@ stays among the placements, so the choice can be undone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -37,6 +38,9 @@ TEMPERATURE, SHARPER = 0.02, 0.2
 """Rise of the score, after deformation, that makes a placement e times as likely, and what the
 score lacks of 1 below which a smaller rise does: the better the fit, the more a rise says."""
 
+LEAST_LIKELY = 0.55
+"""Smallest probability at which a tie is settled. Below, to leave it open says more."""
+
 SURE = 0.95
 """Smallest probability at which an asset without a tie takes the common rotation."""
 
@@ -46,25 +50,27 @@ NEAR_DEGREES = 30.0
 """Largest angle, in degrees, between two rotations that count as the same quarter turn."""
 
 
-def find_consensus(transforms: ArrayLike) -> Consensus | None:
+def find_consensus(transforms: ArrayLike, objects: Sequence[str]) -> Consensus | None:
     """Find the rotation that clear winners have in common, from their transforms (A, 4, 4).
 
-    It is the mean of the rotations near the most frequent quarter turn. Return None if
-    fewer than `LEAST_WINNERS` assets, or less than `LEAST_SHARE` of them, agree.
+    Assets of one of the `objects` (A,) may share their frame, so they count once for each quarter
+    turn that they have. The result is the mean of the rotations near the most frequent one. Return
+    None if fewer than `LEAST_WINNERS`, or less than `LEAST_SHARE` of all, agree.
     """
     linear = np.asarray(transforms, np.float64).reshape(-1, 4, 4)[:, :3, :3]
     rotations = linear / np.cbrt(np.linalg.det(linear))[:, None, None]
     if not len(rotations):
         return None
     nearest = _quarter_of(rotations)
+    votes = [turn for _, turn in set(zip(map(str, objects), nearest.tolist(), strict=True))]
     # The lowest index wins a draw, so that the order of assets does not matter.
-    counts = np.bincount(nearest, minlength=_QUARTERS + 1)[:_QUARTERS]
+    counts = np.bincount(votes, minlength=_QUARTERS + 1)[:_QUARTERS]
     common = int(counts.argmax())
-    members = rotations[nearest == common]
-    if len(members) < LEAST_WINNERS or len(members) < LEAST_SHARE * len(rotations):
+    agreeing = int(counts[common])
+    if agreeing < LEAST_WINNERS or agreeing < LEAST_SHARE * len(votes):
         return None
     others = tuple(np.where(np.arange(_QUARTERS) == common, 0, counts).tolist())
-    return Consensus(_mean_rotation(members), len(rotations), len(members), others)
+    return Consensus(_mean_rotation(rotations[nearest == common]), len(votes), agreeing, others)
 
 
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
@@ -85,7 +91,7 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
     # The score is NaN for an engine that ranks by fitness alone.
     rise = np.nan_to_num((scores - scores[chosen]) / temperature_of(alignment.score))
     by = replace(consensus, probability=float(odds[chosen] / (odds * np.exp(rise)).sum()))
-    if by.probability < 0.5:
+    if by.probability < LEAST_LIKELY:
         return alignment
     if chosen == 0:
         return replace(alignment, settled_by=by)

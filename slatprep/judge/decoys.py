@@ -148,14 +148,13 @@ def _wrong_share(
 ) -> tuple[float, Array]:
     """Return the estimated share of targets that score like decoys, and draws of that share."""
     limit = np.quantile(decoy_scores, 1.0 - LIKE_DECOYS, method="higher")
-    low, low_decoys = (float(np.mean(values <= limit)) for values in (scores, decoy_scores))
-
-    def drawn(share: float, count: int) -> Array:
-        # Half a sample on each side is added (Jeffreys' prior), as samples are finite.
-        return rng.beta(share * count + 0.5, (1 - share) * count + 0.5, DRAWS)
-
-    shares = drawn(low, len(scores)) / drawn(low_decoys, len(decoy_scores))
-    return min(low / low_decoys, 1.0), np.minimum(shares, 1.0)
+    low, low_decoys = (np.count_nonzero(values <= limit) for values in (scores, decoy_scores))
+    count, decoys = len(scores), len(decoy_scores)
+    # Half a target on each side is added (Jeffreys' prior), as samples are finite. The limit is a
+    # decoy itself, so the share of all decoys below it is distributed as that of its rank.
+    drawn = rng.beta(low + 0.5, count - low + 0.5, DRAWS)
+    drawn /= rng.beta(low_decoys, decoys + 1 - low_decoys, DRAWS)
+    return min(low / count / (low_decoys / decoys), 1.0), np.minimum(drawn, 1.0)
 
 
 def _surpassed(scores: Array, by: Array) -> NDArray[np.intp]:

@@ -67,8 +67,9 @@ class Surroundings:
         Distance by which the deformation moves the voxel's position, in voxels.
     tied : ndarray of float32, shape (N,)
         Share of the tied placements, with the chosen one, that give the voxel another
-        class or notably other properties. It is 0 if a consensus or latents chose, or
-        if the mean is at most `HARMLESS`.
+        class or notably other properties. If a consensus or latents chose, the probability
+        that another one is right, times the share of the others that do. It is 0 if the mean is
+        at most `HARMLESS`.
     """
 
     others: NDArray[np.float32]
@@ -109,7 +110,7 @@ def _tied(
 ) -> NDArray[np.float32]:
     """Return `Surroundings.tied` (N,)."""
     tied = np.zeros(len(annotation.place), dtype=np.float32)
-    ties = alignment.open_placements
+    ties, by = alignment.placements, alignment.settled_by
     if not ties:
         return tied
     # If a SLAT has far more voxels than usual, some ties stand for all.
@@ -119,9 +120,12 @@ def _tied(
         properties, material = field.properties[there], field.material[there]
         held = replace(annotation, properties=properties, material=material)
         tied += (there >= 0) & compare_labels(field, annotation, held)[0]
-    tied *= np.float32(len(ties) / len(some) / (len(ties) + 1))
+    others = len(ties) / (len(ties) + 1)
+    tied *= np.float32(others / len(some))
     if tied.mean() <= HARMLESS:
         tied[:] = 0.0  # Ties count as one: the chosen labels are right as often.
+    elif by is not None:
+        tied *= np.float32(np.nan_to_num(1.0 - by.probability) / others)
     return tied
 
 

@@ -14,8 +14,9 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from itertools import combinations
+from itertools import chain, combinations
 from operator import add
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,23 +63,25 @@ BLOCK = 8
 REACH = 6.0
 """Largest distance, in voxels, from a position after half a turn to an annotated voxel."""
 
-_SHRINK = 1.0  # weight, in assets, of the mean of all latents in the mean of each class
+_Found = TypeVar("_Found")
+
+_SHRINK = 1.0  # weight, in objects, of the mean of all latents in the mean of each class
 _RIDGE = 1e-3  # share of a channel's variance
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over latents, each asset with weight one: by class (K,), (K, C); of products (C, C)."""
+    """Sums over latents, each object with weight one: by class (K,), (K, C); of products (C, C)."""
 
     weight: Array
     total: Array
     products: Array
 
-    def __add__(self, other: Moments) -> Moments:
-        """Return the sums over the assets of both."""
-        return Moments(
-            self.weight + other.weight, self.total + other.total, self.products + other.products
-        )
+    @classmethod
+    def summed(cls, some: Sequence[Moments], each: float = 1.0) -> Moments:
+        """Return the sums over several, each with this weight."""
+        arrays = ((one.weight, one.total, one.products) for one in some)
+        return cls(*(each * reduce(add, of) for of in zip(*arrays, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +149,8 @@ class Reliability:
     Attributes
     ----------
     witnesses, agreeing : int
-        Number of sure assets that could be compared, and of those whose latents fit their own
-        labels best.
+        Number of objects with sure assets that could be compared, and of those most of whose
+        assets have latents that fit their own labels best.
     factor : float
         Factor of a log likelihood; 0 if latents are not used.
     least_gain : float
@@ -184,31 +187,38 @@ def fit_models(moments: Iterable[tuple[str, Moments]]) -> list[LatentModel] | No
     `moments` has the object id and the moments of each sure asset, in an order that does not depend
     on the number of jobs. Return None if the other parts of any part have fewer than two classes.
     """
-    sums: dict[int, Moments] = {}
-    for object_id, some in moments:
-        fold = fold_of(object_id)
-        sums[fold] = sums[fold] + some if fold in sums else some
+    sums: dict[int, list[Moments]] = {}
+    for object_id, own in by_object(moments).items():
+        sums.setdefault(fold_of(object_id), []).append(Moments.summed(own, 1.0 / len(own)))
     models = []
     for fold in range(FOLDS):
-        others = [sums[other] for other in sorted(sums) if other != fold]
-        seen = reduce(add, others) if others else None
+        others = [Moments.summed(sums[other]) for other in sorted(sums) if other != fold]
+        seen = Moments.summed(others) if others else None
         if seen is None or np.count_nonzero(seen.weight) < 2:
             return None
         models.append(_model_of(seen))
     return models
 
 
+def by_object(found: Iterable[tuple[str, _Found]]) -> dict[str, list[_Found]]:
+    """Return what was found of assets, by their object."""
+    grouped: dict[str, list[_Found]] = {}
+    for object_id, one in found:
+        grouped.setdefault(object_id, []).append(one)
+    return grouped
+
+
 def _model_of(seen: Moments) -> LatentModel:
-    assets = seen.weight.sum()
-    mean = seen.total.sum(axis=0) / assets
+    objects = seen.weight.sum()
+    mean = seen.total.sum(axis=0) / objects
     present = seen.weight > 0
     by_class = seen.total[present]
     between = (by_class / seen.weight[present, None]).T @ by_class
-    variance = np.diag(seen.products) / assets - mean**2
+    variance = np.diag(seen.products) / objects - mean**2
     ridge = _RIDGE * np.diag(np.where(variance > 0, variance, 1.0))
-    precision: Array = np.linalg.inv((seen.products - between) / assets + ridge)
+    precision: Array = np.linalg.inv((seen.products - between) / objects + ridge)
     means = (seen.total + _SHRINK * mean) / (seen.weight[:, None] + _SHRINK)
-    return LatentModel(means, precision, seen.weight / assets)
+    return LatentModel(means, precision, seen.weight / objects)
 
 
 def weigh(
@@ -274,31 +284,36 @@ def _against(
             yield sums[np.unique(blocks[rows[differ]])]
 
 
-def reliability_of(evidence: Sequence[LatentEvidence]) -> Reliability:
-    """Measure the reliability of latents on assets whose labels are sure.
+def reliability_of(evidence: Iterable[tuple[str, LatentEvidence]]) -> Reliability:
+    """Measure the reliability of latents on assets whose labels are sure, with their object ids.
 
-    The factor is 0 if latents do not prefer their own labels more often than by chance.
+    Assets of one object share labels or latents, so they are one witness. The factor is 0 if
+    latents do not prefer their own labels more often than by chance.
     """
-    compared = [one.against for one in evidence if one.against]
-    agreeing = sum(min(float(blocks.sum()) for blocks in against) > 0 for against in compared)
+    assets = list(evidence)
+    compared = by_object((name, one.against) for name, one in assets if one.against).values()
+    agreeing = sum(
+        2 * sum(min(float(blocks.sum()) for blocks in against) > 0 for against in own) > len(own)
+        for own in compared
+    )
     factor = 0.0
     # The probability of at least that many heads in tosses of a coin.
     if compared and bdtrc(agreeing - 1, len(compared), 0.5) < CHANCE:
-        factor = _factor([np.concatenate(against) for against in compared])
-    gains = np.array([one.gain for one in evidence])
+        factor = _factor([np.concatenate([*chain(*own)]) for own in compared])
+    gains = np.array([one.gain for _, one in assets])
     least = min(0.0, float(np.quantile(gains, RARE))) if factor else -np.inf
     return Reliability(len(compared), agreeing, factor, least)
 
 
 def _factor(compared: Sequence[Array]) -> float:
-    """Return the factor that turns blocks' log likelihoods (B,) into log odds, each asset alike."""
+    """Return the factor that makes log likelihoods (B,) of blocks log odds, each object alike."""
     # Imported here: it takes half a second of CPU, which a build with nothing to do is spared.
     from scipy.optimize import brentq
 
     blocks = np.concatenate(compared)
     weight = np.concatenate([np.full(len(some), 1.0 / len(some)) for some in compared])
     unit = float(np.sqrt(np.average(blocks**2, weights=weight)))
-    # Platt's target is below 1: agreement of all assets is no proof for the next one.
+    # Platt's target is below 1: agreement of all objects is no proof for the next one.
     target = (len(compared) + 1.0) / (len(compared) + 2.0)
 
     def slope(factor: float) -> float:
@@ -320,7 +335,7 @@ def choice_of(found: LatentEvidence, reliability: Reliability) -> tuple[int, Lat
     if reliability.factor == 0.0 or not different[best].any():
         return None
     probability = float(softmax(reliability.factor * found.support)[~different[best]].sum())
-    # A choice cannot be more certain than the latents of sure assets are reliable.
+    # A choice cannot be more certain than the latents of sure objects are reliable.
     probability = min(probability, (reliability.agreeing + 1.0) / (reliability.witnesses + 2.0))
     if probability < DECISIVE:
         return None

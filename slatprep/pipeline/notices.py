@@ -164,11 +164,12 @@ def shared_rotation(new: NextStore) -> Iterator[str]:
     if not any(row.spooled for row, ties in zip(new.rows, tied, strict=True) if ties):
         return
     sure = ~tied & (new.column("verdict") != Verdict.FAILED)
-    if common := find_consensus(new.column("transform")[sure]):
+    voting = new.column("transform")[sure], new.column("object_id")[sure]
+    if common := find_consensus(*voting):
         yield (
             f"{tied.sum():,} of {len(tied):,} assets have other placements that fit about as well, "
-            f"and {common.agreeing:,} of {common.winners:,} others share a rotation: --consensus "
-            "takes that where it is likelier"
+            f"and {common.agreeing:,} of {common.winners:,} other objects share a rotation: "
+            "--consensus takes that where it is likelier"
         )
 
 

@@ -80,11 +80,12 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
     """
     tied = [asset for asset in assets if asset.columns["n_placements"]]
     others = [asset for asset in assets if not asset.columns["n_placements"]]
+    voting = [one.columns for one in others if one.columns["verdict"] != Verdict.FAILED]
     consensus = find_consensus(
-        [one.columns["transform"] for one in others if one.columns["verdict"] != Verdict.FAILED]
+        [one["transform"] for one in voting], [one["object_id"] for one in voting]
     )
     if consensus is None:
-        crew.tell(f"consensus: too few assets share a rotation; {len(tied):,} tied ones stay")
+        crew.tell(f"consensus: too few objects share a rotation; {len(tied):,} tied ones stay")
         return assets
     turned = [one for one in others if not is_common(one.columns["transform"], consensus)]
     tasks = ((asset, context.spool, consensus, context.parameters) for asset in (*tied, *turned))
@@ -97,7 +98,7 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
         return sum(not np.array_equal(before, after) for before, after in pairs)
 
     crew.tell(
-        f"consensus: {consensus.agreeing:,} of {consensus.winners:,} assets without a tie share a "
+        f"consensus: {consensus.agreeing:,} of {consensus.winners:,} objects without a tie share a "
         f"rotation; it gave another placement to {moved(tied):,} of {amount(len(tied), 'tie')}, "
         f"and to {moved(turned):,} of {amount(len(turned), 'asset')} turned otherwise without a tie"
     )
@@ -137,7 +138,7 @@ def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: 
     model_of = [models[witness.fold_of(object_id)] for object_id in objects]
     tasks = ((*task, spool, parameters) for task in zip(assets, model_of, strict=True))
     evidence = list(run_in_order(weigh_asset, tasks, jobs))
-    reliability = witness.reliability_of([evidence[k] for k in good])
+    reliability = witness.reliability_of((objects[k], evidence[k]) for k in good)
     choices = [witness.choice_of(found, reliability) for found in evidence]
     doubted = [
         (asset, spool, choices[k], reliability, model_of[k], parameters)
@@ -194,7 +195,9 @@ def _told(
 ) -> str:
     """Say how reliable latents are, and what they decided."""
     agreeing, good = reliability.agreeing, reliability.witnesses
-    fit = f"{agreeing:,} of {good:,} good assets to compare have latents that fit their labels best"
+    fit = (
+        f"{agreeing:,} of {good:,} good objects to compare have latents that fit their labels best"
+    )
     if not reliability.factor:
         return f"witness: {fit}; too few, so latents are not used"
     decided = [choice[0] for choice in choices if choice]

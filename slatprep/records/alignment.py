@@ -116,8 +116,9 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """The rotation (3, 3) that `agreeing` of `winners` assets without a tie have in common.
+    """The rotation (3, 3) that `agreeing` of `winners` objects without a tie have in common.
 
+    An object whose assets are turned in several ways counts once for each of them.
     `others` counts those at each quarter turn but that, in the order of `distinct_starts`.
     `probability` is the probability that it is right for the asset that takes it by consensus.
     """
@@ -144,8 +145,8 @@ class LatentChoice:
     voxels : int
         Number of voxels to which these two placements give different labels.
     witnesses, agreeing : int
-        Number of other assets that tested the latents, and of those among them whose latents
-        preferred their own labels to wrong ones.
+        Number of other objects whose assets tested the latents, and of those among them whose
+        latents preferred their own labels to wrong ones.
     """
 
     probability: Share

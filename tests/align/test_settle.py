@@ -36,6 +36,11 @@ from slatprep.parameters import AlignParameters
 COMMON = distinct_starts()[14].rotation
 
 
+def consensus_of(transforms: list[np.ndarray]) -> records.Consensus | None:
+    """Return the consensus of assets of an object each."""
+    return find_consensus(transforms, [str(k) for k in range(len(transforms))])
+
+
 def _tilted(rotation: np.ndarray, seed: int) -> np.ndarray:
     tilt = Rotation.from_rotvec(np.random.default_rng(seed).normal(scale=0.05, size=3))
     return make_transform(tilt.as_matrix() @ rotation, [0.01, 0.0, 0.02])
@@ -44,12 +49,12 @@ def _tilted(rotation: np.ndarray, seed: int) -> np.ndarray:
 def test_the_common_rotation_is_found_among_others():
     transforms = [_tilted(COMMON, seed) for seed in range(12)]
     transforms += [_tilted(start.rotation, 50) for start in distinct_starts()[:8]]
-    consensus = find_consensus(transforms)
+    consensus = consensus_of(transforms)
     assert (consensus.winners, consensus.agreeing) == (20, 12)
     assert degrees_between(consensus.rotation, COMMON) < 3.0
     assert np.linalg.det(consensus.rotation) == pytest.approx(1.0)
     shuffled = [transforms[i] for i in np.random.default_rng(0).permutation(20)]
-    again = find_consensus(shuffled)
+    again = consensus_of(shuffled)
     assert again.rotation.tobytes() == consensus.rotation.tobytes()
 
 
@@ -58,14 +63,24 @@ def test_just_enough_is_enough():
     others = [make_transform(start.rotation) for start in distinct_starts()]
     others = [one for one in others if degrees_between(one[:3, :3], COMMON) > 1]
     five = [make_transform(COMMON)] * 5
-    assert find_consensus([]) is find_consensus(five[:4]) is find_consensus(others) is None
-    found = find_consensus(five + others[:5])
+    assert consensus_of([]) is consensus_of(five[:4]) is consensus_of(others) is None
+    found = consensus_of(five + others[:5])
     assert (found.winners, found.agreeing) == (10, 5)
-    assert find_consensus(five + others[:6]) is None
+    assert consensus_of(five + others[:6]) is None
     for degrees, agreeing in ((29.9, 6), (30.1, 5)):
         turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
-        found = find_consensus([*five, make_transform(turn @ COMMON)])
+        found = consensus_of([*five, make_transform(turn @ COMMON)])
         assert found.agreeing == agreeing
+
+
+def test_assets_of_one_object_count_once_for_each_way_they_are_turned():
+    """Annotations of one grid have its frame, and so do views of one SLAT."""
+    turns = [make_transform(COMMON)] * 40 + [make_transform(AWAY[0])] * 9
+    objects = ["duck"] * 36 + ["cup", "bear", "bell", "vase"] + ["duck"] * 8 + ["cup"]
+    found = find_consensus(turns, objects)
+    assert (found.winners, found.agreeing, sorted(found.others)[-2:]) == (7, 5, [0, 2])
+    assert find_consensus(turns[1:], ["duck", *objects[2:]]).agreeing == 5
+    assert find_consensus(turns[:39], objects[:39]) is None
 
 
 def test_no_turn_and_half_a_turn_are_angles_too():
@@ -84,7 +99,7 @@ AWAY = [s.rotation for s in distinct_starts() if degrees_between(s.rotation, COM
 
 
 def _agreeing(count: int, others: int = 0) -> records.Consensus:
-    return find_consensus([make_transform(turn) for turn in [COMMON] * count + AWAY[:others]])
+    return consensus_of([make_transform(turn) for turn in [COMMON] * count + AWAY[:others]])
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +166,7 @@ def test_ties_of_a_dataset_of_two_frames_are_no_surer_than_its_counts(agree, opp
     """Half a turn apart, both of a tie's placements are frames of the dataset."""
     half = np.diag([-1.0, -1.0, 1.0]) @ COMMON
     turns = [COMMON] * agree + [half] * opposite
-    consensus = find_consensus([make_transform(turn) for turn in turns])
+    consensus = consensus_of([make_transform(turn) for turn in turns])
     tied = aligned(make_transform(COMMON), make_transform(half), score=1.0)
     by = settle(tied, latents_of([[1, 2, 3]]), consensus).settled_by
     assert (0 if by is None else by.probability) == pytest.approx(taken, abs=0.01)

@@ -124,6 +124,16 @@ def test_the_stated_rates_are_the_true_ones(mixed):
     assert np.floor(least) <= (sure & truly).sum() <= np.ceil(most)
 
 
+@pytest.mark.parametrize("few", [1, 2, 3, 5])
+def test_the_interval_of_few_decoys_holds_the_true_share(few):
+    """Its upper end is to be too low in one draw of 40."""
+    pool = made(200, (0.3, 0.5), 1)
+    targets = np.concatenate([made(60, (0.3, 0.5), 5), right(140)])
+    rng = np.random.default_rng(few)
+    draws = [rated(targets, pool[rng.choice(200, few, replace=False)]) for _ in range(200)]
+    assert np.mean([found.wrong_share_range[1] < 0.3 for found in draws]) < 0.05
+
+
 def test_of_shuffled_pairs_hardly_any_is_kept():
     found = rated(wrong(300, 7), wrong(200))
     assert found.wrong_share > 0.9

@@ -155,8 +155,13 @@ def test_ties_count_by_how_many_of_them_change_the_class(most, ties, share, monk
     changes = np.isin(latents.coords[:, 2], [*range(22, 27), *range(37, 42)])
     tied = surroundings_of(field, latents, fitted(None, *ties), annotation).tied
     np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
-    settled = replace(fitted(None, *ties), settled_by=records.Consensus(np.eye(3), 5, 5))
-    assert not surroundings_of(field, latents, settled, annotation).tied.any()
+    # Once settled, the others together have what the choice's probability leaves.
+    left = share * (len(ties) + 1) / len(ties)
+    for probability, other in ((1.0, 0.0), (0.8, 0.2), (np.nan, 0.0)):
+        by = records.Consensus(np.eye(3), 5, 5, probability=probability)
+        settled = replace(fitted(None, *ties), settled_by=by)
+        tied = surroundings_of(field, latents, settled, annotation).tied
+        np.testing.assert_allclose(tied, np.where(changes, other * left, 0.0), atol=1e-7)
 
 
 def test_ties_that_change_few_classes_count_as_one():

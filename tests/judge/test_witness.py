@@ -247,6 +247,11 @@ def compared(*blocks: list[float], gain: float = 1.0) -> LatentEvidence:
     return LatentEvidence(np.zeros(1), np.zeros((1, 1), np.int64), 9, gain, against)
 
 
+def apart(evidence: list[LatentEvidence]) -> list[tuple[str, LatentEvidence]]:
+    """Return what assets of an object each say."""
+    return [(str(number), one) for number, one in enumerate(evidence)]
+
+
 HALF = 0.2 * 11 / 12 + 0.4
 """Of shares p and 1 - p with log odds f and -f, the slope is 0 where
 sigma(f) = (2 p - 1) target + 1 - p, with Platt's target of n that agree, (n + 1) / (n + 2)."""
@@ -280,7 +285,7 @@ HEARD = [
 def test_a_factor_makes_log_likelihoods_log_odds_where_witnesses_agree(
     evidence, witnesses, agreeing, factor
 ):
-    found = reliability_of(evidence)
+    found = reliability_of(apart(evidence))
     assert (found.witnesses, found.agreeing) == (witnesses, agreeing)
     assert (
         found.factor > 0.0 if factor is None else found.factor == pytest.approx(factor, 1e-6, 0.0)
@@ -288,11 +293,38 @@ def test_a_factor_makes_log_likelihoods_log_odds_where_witnesses_agree(
     assert found.least_gain == -np.inf if factor == 0.0 else np.isfinite(found.least_gain)
 
 
+def test_assets_of_one_object_are_one_witness():
+    """They share their latents or their labels, and agree or differ together."""
+    same = [(f"{k % 3}", compared([1.0])) for k in range(36)]
+    assert (found := reliability_of(same)).factor == 0.0 and found.witnesses == 3
+    rows = [(str(k), compared([0.25])) for k in range(20) for _ in range(k + 1)]
+    found = reliability_of(rows)
+    assert (found.witnesses, found.agreeing) == (20, 20)
+    assert found.factor == pytest.approx(np.log(21.0) / 0.25)
+    # An object agrees if most of its assets do.
+    duck, cup = [AGREES, DIFFERS], [AGREES, AGREES, DIFFERS]
+    found = reliability_of([*(("duck", one) for one in duck), *(("cup", one) for one in cup)])
+    assert (found.witnesses, found.agreeing) == (2, 1)
+
+
+def test_a_model_counts_each_object_once():
+    rng = np.random.default_rng(5)
+    one, two = (rng.normal(size=(50, 8)).astype(np.float32) for _ in range(2))
+    halves = np.repeat([0, 1], 25).astype(np.uint8)
+    first, second = (moments_of(feats, halves) for feats in (one, two))
+    here, there, *_ = (ids_of(fold, 1)[0] for fold in range(3))
+    once = fit_models([(here, first), (there, second)])
+    often = fit_models([(here, first), *[(there, second)] * 7])
+    for before, after in zip(once, often, strict=True):
+        np.testing.assert_allclose(after.means, before.means)
+        np.testing.assert_allclose(after.precision, before.precision)
+
+
 def test_the_least_gain_is_that_of_one_asset_in_two_hundred_and_never_positive():
     gains = np.arange(201.0) - 5.0
     evidence = [compared([1.0], gain=gain) for gain in gains]
-    assert reliability_of(evidence).least_gain == pytest.approx(-4.0)
-    assert reliability_of([compared([1.0], gain=5.0)] * 20).least_gain == 0.0
+    assert reliability_of(apart(evidence)).least_gain == pytest.approx(-4.0)
+    assert reliability_of(apart([compared([1.0], gain=5.0)] * 20)).least_gain == 0.0
 
 
 SURE = Reliability(200, 200, 0.5, 0.0)
@@ -411,7 +443,7 @@ def models_of(latents: Latents) -> tuple[list[LatentModel], Reliability]:
     assets = [Asset(number, latents) for number in range(40)]
     models = fit_models((a.object_id, moments_of(a.latents.feats, a.material)) for a in assets)
     assert models is not None
-    return models, reliability_of([asset.evidence(models) for asset in assets])
+    return models, reliability_of((asset.object_id, asset.evidence(models)) for asset in assets)
 
 
 UPSIDE_DOWN = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())

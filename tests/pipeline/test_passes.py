@@ -105,7 +105,7 @@ def test_building_without_it_brings_the_first_placements_back(habitual, agreed, 
     (advice,) = (text for text in unsettled.warnings if "--consensus" in text)
     sure = open_store(store).column("ambiguity") <= THRESHOLDS.good_ambiguity
     assert advice.startswith(f"{(~sure).sum()} of {len(sure)} assets have other placements")
-    assert "others share a rotation" in advice
+    assert "other objects share a rotation" in advice
     # It is for assets that were read now.
     taken = SourceStore(open_store(store))
     rows = [Row(name, 1, store=0, row=row) for row, name in enumerate(taken.ids)]

@@ -174,7 +174,7 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
         return
     field, properties = asset.normalised_field, asset.properties
     # The confidence comes from classes alone, if there are any and nothing ties.
-    tied = bool(record.alignment.open_placements)
+    tied = bool(record.alignment.placements)
     if tied or not field.classified:
         if asset.store.cached_column("clipped_grid")[asset.index].any():
             return  # The confidence came from values that the store does not hold.
