@@ -73,9 +73,10 @@ endif
 	exit $$status
 
 $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(INSTALLED)
-	rm -rf $(DEMO)
-	$(BIN)/slatprep make-demo $(DEMO) --assets $(ASSETS) --seed $(SEED) --quiet
-	@touch $@
+	@new=$(DEMO)-$$$$; \
+	$(BIN)/slatprep make-demo $$new --assets $(ASSETS) --seed $(SEED) --quiet || \
+	    { status=$$?; rm -rf $$new; exit $$status; }; \
+	rm -rf $(DEMO) && mv $$new $(DEMO) && touch $@
 
 # -- development ------------------------------------------------------------
 
