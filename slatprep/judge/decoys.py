@@ -154,7 +154,7 @@ def _wrong_share(
     # decoy itself, so the share of all decoys below it is distributed as that of its rank.
     drawn = rng.beta(low + 0.5, count - low + 0.5, DRAWS)
     drawn /= rng.beta(low_decoys, decoys + 1 - low_decoys, DRAWS)
-    return min(low / count / (low_decoys / decoys), 1.0), np.minimum(drawn, 1.0)
+    return min(float(low / count / (low_decoys / decoys)), 1.0), np.minimum(drawn, 1.0)
 
 
 def _surpassed(scores: Array, by: Array) -> NDArray[np.intp]:
