@@ -91,8 +91,8 @@ def train(
     training: TrainingOptions,
     verdicts: options.UsableVerdicts = None,
     splits: options.SplitOptions,
-    device: Literal["cpu", "cuda"] = "cpu",
-    workers: options.Count = 0,
+    device: Literal["cpu", "cuda"] | None = None,
+    workers: options.Count | None = None,
     threads: options.Positive | None = None,
 ) -> None:
     """Train SLAT-Phys's decoder on STORE.
@@ -113,9 +113,9 @@ def train(
         paper: 2,000 steps, and 4 accumulated batches per step (the paper does not give this
         number). Other options override the preset.
     device
-        Device that computes.
+        Device that computes. [default: the GPU if there is one]
     workers
-        Number of processes that read ahead.
+        Number of processes that read ahead. [default: 0, for a GPU 1]
     threads
         Number of threads that compute. [default: all cores]
 
@@ -127,7 +127,7 @@ def train(
     """
     from slatprep.learn import require_torch
 
-    require_torch(device)
+    device = require_torch(device)
     import torch
 
     from slatprep.learn.train import TrainParameters
@@ -150,6 +150,7 @@ def train(
             own.pop("steps", None)
         training = dataclasses.replace(training, **own)
     torch.set_num_threads(threads or os.cpu_count() or 1)
+    output.note(f"device:  {device}")
     opened, rule = options.opened(store), splits.rule
     options.split_of_objects(output, opened, rule, f"by {rule['by']}")
     left_out: list[str] = []
@@ -179,7 +180,7 @@ def train(
                 directory,
                 dataclasses.replace(chosen, size=name),
                 device=device,
-                workers=workers,
+                workers=int(device == "cuda") if workers is None else workers,
                 steps=steps,
                 progress=partial(_tell_epoch, output, name),
                 note=output.note,
@@ -268,29 +269,22 @@ def predict(
         With --gaussians: give far Gaussians class 7 and properties 0, omit them, or give them the
         nearest material.
     device
-        Device that computes. [default: cpu; for an image the GPU if there is one]
+        Device that computes. [default: the GPU if there is one]
     batch_voxels
         Decode assets together up to this number of voxels.
 
     Example
     -------
     slatprep predict latents --checkpoint runs/small --out predictions
-    slatprep predict data/demo.zarr --checkpoint runs/small/best.pt --out predictions --device cuda
-    slatprep predict cup.png --checkpoint runs/large --out cup --gaussians cup.ply --device cuda
+    slatprep predict data/demo.zarr --checkpoint runs/small/best.pt --out predictions --device cpu
+    slatprep predict cup.png --checkpoint runs/large --out cup --gaussians cup.ply
     """
     from slatprep.learn import require_torch
 
     is_image = source.suffix.lower() in _IMAGES
-    require_torch(device or "cpu")
-    import torch
-
+    device = require_torch(device)
+    output.note(f"device:  {device}")
     from slatprep.latents import LatentsReader
-
-    if device is None:
-        # TRELLIS needs a GPU.
-        device = "cuda" if is_image and torch.cuda.is_available() else "cpu"
-        if is_image:
-            output.note(f"TRELLIS and the decoder run on {device}")
     from slatprep.learn import predict as work
     from slatprep.learn.published import SECONDS, SECONDS_OF_OTHERS
 

@@ -27,10 +27,10 @@ def __getattr__(name: str) -> object:
         raise
 
 
-def require_torch(device: str = "cpu") -> None:
-    """Make sure that PyTorch is installed and finds the device, ``cpu`` or ``cuda``.
+def require_torch(device: str | None = "cpu") -> str:
+    """Make sure that PyTorch is installed and finds the device, ``cpu`` or ``cuda``; return it.
 
-    ConfigError if it cannot be imported, with the command that installs it, or finds no ``cuda``.
+    None stands for the GPU, or the processor if there is none. ConfigError if it cannot be imported, with the command that installs it, or finds no ``cuda``.
     """
     with needing("decoders need", "train"):
         import torch
@@ -39,3 +39,4 @@ def require_torch(device: str = "cpu") -> None:
             f"PyTorch {torch.__version__} finds no CUDA device; expected an NVIDIA GPU and a build "
             "of PyTorch for it, or --device cpu"
         )
+    return device or ("cuda" if torch.cuda.is_available() else "cpu")

@@ -23,6 +23,7 @@ from support.made_store import edit_attributes, make_store
 
 from slatprep import InputError, open_store
 from slatprep.extract import Session
+from slatprep.learn import require_torch
 from slatprep.learn.decoder import make_decoder
 from slatprep.learn.evaluate import evaluate_store
 from slatprep.learn.metrics import OURS
@@ -139,6 +140,13 @@ def test_a_device_that_is_not_there_is_named(checkpoint, tmp_path, monkeypatch, 
     words = (source, *weights, "--out", tmp_path / "out", "--device", "cuda")
     assert "finds no CUDA device" in refused(command, *words)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("there", "device"), [(True, "cuda"), (False, "cpu")])
+def test_the_gpu_is_the_default_where_there_is_one(monkeypatch, there, device):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    assert require_torch(None) == device
+    assert require_torch("cpu") == "cpu"
 
 
 def test_one_file_of_either_kind(checkpoint, tmp_path):
@@ -261,7 +269,7 @@ def test_an_image_becomes_gaussians_with_materials(checkpoint, tmp_path, trellis
     # SLAT-Phys's times stand beside; its speed-ups follow from the sum of its stages.
     told = step("predict", image, "--checkpoint", checkpoint, "--out", tmp_path / "shown")
     assert "SLAT-Phys, s" in told and "4.69" in told and "NeRF2Physics 1,196 s" in told
-    assert "TRELLIS and the decoder run on" in told
+    assert "device:  cpu" in told
     whole = sum(spent for stage, spent in SECONDS.items() if stage != "in all")
     assert [round(spent / whole) for spent in SECONDS_OF_OTHERS.values()] == [121, 128]
     # A second time the latents are there; what the decoder does is done again.
