@@ -127,7 +127,7 @@ def train(
     """
     from slatprep.learn import require_torch
 
-    device = require_torch(device)
+    chosen_device = require_torch(device)
     import torch
 
     from slatprep.learn.train import TrainParameters
@@ -150,7 +150,7 @@ def train(
             own.pop("steps", None)
         training = dataclasses.replace(training, **own)
     torch.set_num_threads(threads or os.cpu_count() or 1)
-    output.note(f"device:  {device}")
+    output.note(f"device:  {chosen_device}")
     opened, rule = options.opened(store), splits.rule
     options.split_of_objects(output, opened, rule, f"by {rule['by']}")
     left_out: list[str] = []
@@ -179,8 +179,8 @@ def train(
                 store,
                 directory,
                 dataclasses.replace(chosen, size=name),
-                device=device,
-                workers=int(device == "cuda") if workers is None else workers,
+                device=chosen_device,
+                workers=int(chosen_device == "cuda") if workers is None else workers,
                 steps=steps,
                 progress=partial(_tell_epoch, output, name),
                 note=output.note,
@@ -282,8 +282,8 @@ def predict(
     from slatprep.learn import require_torch
 
     is_image = source.suffix.lower() in _IMAGES
-    device = require_torch(device)
-    output.note(f"device:  {device}")
+    chosen_device = require_torch(device)
+    output.note(f"device:  {chosen_device}")
     from slatprep.latents import LatentsReader
     from slatprep.learn import predict as work
     from slatprep.learn.published import SECONDS, SECONDS_OF_OTHERS
@@ -293,11 +293,11 @@ def predict(
             "--gaussians goes with an image; `slatprep decode-slat` makes Gaussians of latents, "
             "and `slatprep transfer` gives them materials"
         )
-    decoder = work.load_checkpoint(checkpoint, device)
+    decoder = work.load_checkpoint(checkpoint, chosen_device)
     space = decoder.contents.latents
     session, sampling = None, dict[str, float]()
     if is_image:
-        source, session, sampling = _sample_latents(output, source, out, seed, device)
+        source, session, sampling = _sample_latents(output, source, out, seed, chosen_device)
         standardised = "no"  # TRELLIS samples latents on the scale that its decoders take.
     read = LatentsReader(source, assets, space, standardised, output.note, output.problem)
     counts = {"predicted": 0, "voxels": 0}

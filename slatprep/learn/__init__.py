@@ -30,7 +30,8 @@ def __getattr__(name: str) -> object:
 def require_torch(device: str | None = "cpu") -> str:
     """Make sure that PyTorch is installed and finds the device, ``cpu`` or ``cuda``; return it.
 
-    None stands for the GPU, or the processor if there is none. ConfigError if it cannot be imported, with the command that installs it, or finds no ``cuda``.
+    None stands for the GPU, or the processor if there is none. ConfigError if PyTorch cannot be
+    imported, with the command that installs it, or finds no ``cuda``.
     """
     with needing("decoders need", "train"):
         import torch
