@@ -71,11 +71,13 @@ def hostile_value(chance: random.Random) -> Any:
 
 
 def change_values(state: dict[str, Any], chance: random.Random) -> None:
+    about = state["about"]
     for _ in range(chance.randrange(1, 4)):
         holder: Any = chance.choice((state, state, state["model"]))
         if holder is state and chance.random() < 0.3:
-            told = {"properties": [["density", "kg/m^3", True]], "classes": [], "latents": {}}
-            told[chance.choice(("classes", "properties", "latents", "x"))] = chance.choice(
+            told = json.loads(about)
+            part = chance.choice((told, told["normalization"], told["contents"]))
+            part[chance.choice((*part, "x"))] = chance.choice(
                 (
                     [],
                     None,
@@ -87,7 +89,7 @@ def change_values(state: dict[str, Any], chance: random.Random) -> None:
                     1e99,
                 )
             )
-            state["contents"] = json.dumps(told)
+            state["about"] = json.dumps(told)
             continue
         key = chance.choice((*holder, "other", 3, ("a",)))
         if chance.random() < 0.15:
@@ -194,7 +196,7 @@ def make_checkpoint(chance: random.Random) -> bytes:
         holder = chance.choice((state, state["model"]))
         holder[chance.choice(("optimizer", "other", *state["model"]))] = torch.zeros(rows)
         if kind not in ("values", "bytes"):
-            state["ranges"] = None
+            state["about"] = None
     out = io.BytesIO()
     try:
         torch.save(state, out)

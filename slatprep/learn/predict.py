@@ -6,34 +6,34 @@ ranges, so it serves without the store that the decoder was trained on.
 
 from __future__ import annotations
 
+import json
 import time
 import zipfile
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import unquote
 
 import numpy as np
-import orjson
 import torch
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.learn.decoder import PhysicsDecoder, make_decoder
+from slatprep.learn.decoder import SIZES, PhysicsDecoder, make_decoder
 from slatprep.learn.runs import BEST, read_state
-from slatprep.normalize import denormalize_properties, normalization_of
+from slatprep.normalize import denormalize_properties
 from slatprep.readers.files import refusing
 from slatprep.records import (
-    MANY_BACKGROUND,
-    MAX_PROPERTIES,
     PIXIEVERSE,
     Contents,
     Normalization,
     StructuredLatents,
+    labels_of,
+    one_of,
 )
 from slatprep.storage.atomic import staged
-from slatprep.storage.documents import adapter_of
+from slatprep.storage.documents import read_as
 from slatprep.storage.files import file_digest, file_name
 
 BATCH_VOXELS = 65_536
@@ -80,26 +80,31 @@ class PredictedField:
     seconds: float
 
 
+@dataclass(frozen=True)
+class _About:
+    """What a checkpoint says of its decoder beside the weights, as one JSON text."""
+
+    size: Annotated[str, one_of(*SIZES)]
+    normalization: Normalization
+    contents: Contents
+
+    def __post_init__(self) -> None:
+        labels_of(self.contents.classes)
+        if [(p.name, p.log10) for p in self.contents.properties] != [
+            (span.name, span.log10) for span in self.normalization.ranges
+        ]:
+            raise ValueError("ranges and properties differ")
+        if not all(-np.inf < s.lo < s.hi < np.inf for s in self.normalization.ranges):
+            raise ValueError(f"ranges are {self.normalization.spans.tolist()}")
+
+
 def checkpoint_state(
     model: PhysicsDecoder, size: str, normalization: Normalization, contents: Contents = PIXIEVERSE
 ) -> dict[str, Any]:
-    """Return the state of a decoder for a checkpoint: tensors and plain values."""
-    ranges = normalization.spans.tolist()
-    # As JSON, since a checkpoint may hold only tensors and plain values.
-    held = orjson.dumps(
-        {
-            "properties": [[p.name, p.unit, p.log10] for p in contents.properties],
-            "classes": contents.classes,
-            "latents": contents.latents,
-        }
-    ).decode()
-    return {
-        "size": size,
-        "model": model.state_dict(),
-        "ranges": ranges,
-        "ranges_source": normalization.source,
-        "contents": held,
-    }
+    """Return the state of a decoder for a checkpoint: tensors, and a text as `_About` reads it."""
+    # Not by orjson, which has no infinity, as the bounds of properties may be.
+    about = json.dumps(asdict(_About(size, normalization, contents)))
+    return {"model": model.state_dict(), "about": about}
 
 
 def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
@@ -114,63 +119,24 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
     state = read_state(path)
     wanted = "best.pt of a run of `slatprep train`; one without ranges is trained anew"
     with refusing(path, "holds no decoder with its ranges", wanted):
-        size, source = _text_in(state, "size"), _text_in(state, "ranges_source")
-        contents = _contents_in(state)
-        ranges = _ranges_in(state, len(contents.properties))
-        normalization = normalization_of(ranges, source, contents.properties)
+        if not isinstance(text := state["about"], str):  # A list may be endless in print.
+            raise TypeError(f"about is {type(text).__name__}, not a text")
+        about = read_as(_About, text)
+        ranges = about.normalization.spans
         ends = np.array([[-1.0] * len(ranges), [1.0] * len(ranges)], dtype=np.float32)
         with np.errstate(over="ignore"):
-            values = denormalize_properties(ends, normalization)
+            values = denormalize_properties(ends, about.normalization)
         if not np.isfinite(values).all():
             raise ValueError(f"ranges {ranges.tolist()} lead to values that are not finite")
-        model = make_decoder(size, contents)
+        model = make_decoder(about.size, about.contents)
         for name, weight in state["model"].items():
             if not weight.is_floating_point():
                 raise TypeError(f"weights {name} are {weight.dtype}, not real numbers")
         model.load_state_dict(state["model"])
         if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
             raise ValueError("weights are not all finite")
-    return Checkpoint(
-        model.to(device).eval(), size, normalization, contents, file_digest(path), device
-    )
-
-
-def _text_in(state: dict[str, Any], name: str) -> str:
-    """Return a text of a checkpoint; TypeError for other types, which may be endless in print."""
-    text = state[name]
-    if not isinstance(text, str):
-        raise TypeError(f"{name} is {type(text).__name__}, not a text")
-    return text
-
-
-def _ranges_in(state: dict[str, Any], count: int) -> NDArray[np.float64]:
-    """Return the ranges (count, 2); types are checked first, as nested lists may be endless."""
-    rows = state["ranges"]
-    if not (isinstance(rows, list) and len(rows) == count):
-        raise TypeError(f"ranges are not a list of {count}")
-    if not all(isinstance(row, list) and list(map(type, row)) == [float] * 2 for row in rows):
-        raise TypeError("ranges are not two numbers each")
-    ranges = np.array(rows, dtype=np.float64)
-    if not (np.isfinite(ranges).all() and (ranges[:, 0] < ranges[:, 1]).all()):
-        raise ValueError(f"ranges are {rows}")
-    return ranges
-
-
-def _contents_in(state: dict[str, Any]) -> Contents:
-    """Return the contents of the store that a decoder was trained on."""
-    document = orjson.loads(_text_in(state, "contents"))
-    document["properties"] = [
-        dict(zip(("name", "unit", "log10"), row, strict=True)) for row in document["properties"]
-    ]
-    # The document has no bounds of values, since JSON has no infinity.
-    contents: Contents = adapter_of(Contents).validate_json(orjson.dumps(document), strict=True)
-    if not 0 < len(contents.properties) <= MAX_PROPERTIES:
-        raise ValueError(f"it has {len(contents.properties)} properties, not 1 to {MAX_PROPERTIES}")
-    if len(contents.classes) > MANY_BACKGROUND:
-        raise ValueError(f"it has {len(contents.classes)} classes, not at most {MANY_BACKGROUND}")
-    if len(set(contents.classes)) < len(contents.classes):
-        raise ValueError("two of its classes have one name")
-    return contents
+    model.to(device).eval()
+    return Checkpoint(model=model, **vars(about), sha256=file_digest(path), device=device)
 
 
 def predict(

@@ -289,8 +289,19 @@ def shared(depth: int = 9, width: int = 10) -> list[Any]:
     return inner
 
 
+def told(state: dict[str, Any], change: Callable[[dict[str, Any]], object]) -> None:
+    """Change what a checkpoint says of its decoder."""
+    about = json.loads(state["about"])
+    change(about)
+    state["about"] = json.dumps(about)
+
+
 def with_contents(state: dict[str, Any], **change: object) -> None:
-    state["contents"] = json.dumps(json.loads(state["contents"]) | change)
+    told(state, lambda about: about["contents"].update(change))
+
+
+def with_range(state: dict[str, Any], **change: object) -> None:
+    told(state, lambda about: about["normalization"]["ranges"][0].update(change))
 
 
 def retyped(state: dict[str, Any], kind: torch.dtype) -> None:
@@ -299,24 +310,23 @@ def retyped(state: dict[str, Any], kind: torch.dtype) -> None:
 
 NONE = r"best\.pt: holds no decoder with its ranges"
 CHANGES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "ranges that hold themselves": (lambda s: s.update(ranges=shared()), "ranges are not a list"),
-    "rows that hold themselves": (lambda s: s.update(ranges=[shared()] * 3), "two numbers each"),
-    "a size without end": (lambda s: s.update(size=shared()), "size is list, not a text"),
-    "contents without end": (lambda s: s.update(contents=shared()), "contents is list"),
-    "a source without end": (lambda s: s.update(ranges_source=shared()), "ranges_source is list"),
-    "whole numbers": (lambda s: s.update(ranges=[[0, 1]] * 3), "two numbers each"),
-    "ranges beyond floats": (lambda s: s.update(ranges=[[0.0, 1e308]] * 3), "not finite"),
-    "ranges beyond float32": (lambda s: s.update(ranges=[[0.0, 300.0]] * 3), "not finite"),
-    "one name for two classes": (lambda s: with_contents(s, classes=["a", "a"]), "one name"),
-    "too many": (lambda s: with_contents(s, classes=[*map(str, range(300))]), "not at most 254"),
-    "no property": (lambda s: with_contents(s, properties=[]), "0 properties"),
+    "what it says without end": (lambda s: s.update(about=shared()), "about is list, not a text"),
+    "a range that is none": (lambda s: with_range(s, lo="0"), "valid number"),
+    "ranges beyond floats": (lambda s: with_range(s, hi=1e308), "not finite"),
+    "ranges beyond float32": (lambda s: with_range(s, hi=300.0), "not finite"),
+    "ranges without an end": (lambda s: with_range(s, hi=float("inf")), "ranges are"),
+    "ranges of other properties": (lambda s: with_range(s, name="mass"), "properties differ"),
+    "one name for two classes": (lambda s: with_contents(s, classes=["a", "a"]), "a name each"),
+    "too many": (lambda s: with_contents(s, classes=[*map(str, range(300))]), "at most 254"),
+    "no property": (lambda s: with_contents(s, properties=[]), "properties differ"),
     "whole weights": (lambda s: retyped(s, torch.int8), "torch.int8, not real numbers"),
     "complex weights": (lambda s: retyped(s, torch.complex64), "torch.complex64, not real numbers"),
     "weights that are none": (lambda s: s.update(model=shared()), "holds no decoder"),
-    "no ranges": (lambda s: s.pop("ranges"), NONE),
-    "ranges turned about": (lambda s: s.update(ranges=[[1.0, 0.0]] * 3), NONE),
-    "another size": (lambda s: s.update(size="huge"), NONE),
-    "ranges without end": (lambda s: s.update(ranges=torch.zeros(1).expand(10**9)), NONE),
+    "no ranges": (lambda s: told(s, lambda about: about.pop("normalization")), NONE),
+    "nothing said": (lambda s: s.pop("about"), NONE),
+    "ranges turned about": (lambda s: with_range(s, lo=1e9), "ranges are"),
+    "another size": (lambda s: told(s, lambda about: about.update(size="huge")), NONE),
+    "a tensor without end": (lambda s: s.update(about=torch.zeros(1).expand(10**9)), NONE),
     "a weight too few": (lambda s: s["model"].popitem(), NONE),
     "no numbers": (lambda s: s["model"]["regression.weight"].fill_(float("nan")), NONE),
 }
