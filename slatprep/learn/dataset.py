@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from slatprep.errors import ConfigError, amount
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
-from slatprep.learn.splits import assign_store, select_assets
+from slatprep.learn.splits import select_assets
 from slatprep.readers.splits import Shares, Split
 from slatprep.records import FEATS_MEAN as FEATS_MEAN
 from slatprep.records import FEATS_STD as FEATS_STD
@@ -162,9 +162,7 @@ class SlatDataset(Dataset[Item]):
             raise ConfigError(f"seed is {seed}; expected 0 or more")
         self.store = open_store(store, copy=True)
         self.split = split
-        if split is not None and splits is None:
-            splits = assign_store(self.store, shares=shares).splits
-        every = select_assets(self.store, split, splits=splits)
+        every = select_assets(self.store, split, shares=shares, splits=splits)
         fit = select_assets(self.store, verdicts=verdicts, max_ambiguity=max_ambiguity)
         self.indices = np.intersect1d(every, fit, assume_unique=True)
         self._left_out = len(every) - len(self)
