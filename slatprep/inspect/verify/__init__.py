@@ -33,13 +33,6 @@ from slatprep.workers.local import Jobs, require_shared, run_unordered
 
 __all__ = ["Finding", "SourceRoots", "Verification", "verify_store"]
 
-SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share", "confidence",
-          "expected_accuracy")  # fmt: skip
-"""Columns of shares and probabilities, in 0..1."""
-
-DISTANCES = ("inlier_rmse", "inlier_rmse_backward", "margin")
-"""Columns of numbers that are at least 0, or NaN if undefined."""
-
 WORDS = {
     words.__name__.lower(): tuple(map(str, words)) for words in (Engine, Model, Search, Verdict)
 }
@@ -54,15 +47,17 @@ _TEXTS = {
 }
 """Pattern of the allowed texts of a column, and its description."""
 
-_NUMBERS = {
-    **dict.fromkeys(SHARES, 1.0),
-    **dict.fromkeys(DISTANCES, np.inf),
-    "unphysical": RESOLUTION**3,
-}
-"""Largest allowed number of a column; the smallest is 0."""
+_SHARES = ("fitness", "fitness_backward", "overlap", "ambiguity", "valid_share", "confidence",
+           "expected_accuracy")  # fmt: skip
 
-_LEAST_MARGIN = -1.0
-"""Smallest margin: that of a stated frame that another placement beats."""
+_NUMBERS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(_SHARES, (0.0, 1.0)),
+    "inlier_rmse": (0.0, np.inf),
+    "inlier_rmse_backward": (0.0, np.inf),
+    "margin": (-1.0, np.inf),  # Below 0 if another placement beats a stated frame.
+    "unphysical": (0.0, RESOLUTION**3),
+}
+"""Least and largest allowed number of a column; without a largest, NaN is allowed too."""
 
 _TOLERANCE = 1e-6
 """Largest allowed difference of a rotation's determinant from 1, due to rounding."""
@@ -216,11 +211,10 @@ def index_findings(store: Store) -> Iterator[Finding]:
         for asset_id, text in zip(ids, store.column(name), strict=True):
             if not allowed.fullmatch(text):
                 yield Finding(f"asset/{name}", asset_id, f"is {text!r}", expected)
-    for name, most in _NUMBERS.items():
+    for name, (least, most) in _NUMBERS.items():
         values = store.column(name)
-        least = _LEAST_MARGIN if name == "margin" else 0.0
         fine = (values >= least) & (values <= most)
-        if name in DISTANCES:
+        if most == np.inf:
             fine |= np.isnan(values)
         for wrong in np.flatnonzero(~fine):
             yield Finding(
