@@ -135,16 +135,11 @@ def selection_of_run(predictions: Path) -> tuple[Path, dict[str, Any], dict[str,
         file = predictions.resolve().parent / RUN_FILE
     if not file.exists():
         return None
-    try:
+    expected = "what `slatprep train` wrote; or give --split-by or --shares"
+    with refusing(file, "does not say which assets the run chose", expected):
         run = read_document(file, RUN_BYTES)
         named = {name: run[name] for name in ("shares", "verdicts", "max_ambiguity")}
         filters = dict(vars(adapter_of(_Selection).validate_python(named)))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            file,
-            f"does not say which assets the run chose ({error!r})",
-            "what `slatprep train` wrote; or give --split-by or --shares",
-        ) from error
     lists = file.with_name(SPLITS_FILE)
     by = str(lists) if lists.exists() else HASH
     return file, {"by": by, "shares": filters.pop("shares")}, filters

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from slatprep.errors import InputError
 from slatprep.learn.metrics import METRICS, SPREADS
+from slatprep.readers.files import refusing
 
 
 @dataclass(frozen=True)
@@ -114,10 +115,8 @@ def read_scores(path: Path, metrics: Sequence[str] = METRICS) -> tuple[Published
             f"has {len(longer[0])} entries under {len(header)} columns, for {longer[0][0][:80]!r}"
         )
         raise InputError(path, found, expected)
-    try:
+    with refusing(path, "has a row that is not numbers", expected):
         return tuple(
             PublishedScore(row[0], {n: float(row[k]) for n, k in places.items() if row[k].strip()})
             for row in rows
         )
-    except (ValueError, IndexError) as error:
-        raise InputError(path, f"has a row that is not numbers ({error})", expected) from error
