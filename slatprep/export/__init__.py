@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -37,6 +37,10 @@ FORMATS = {
 The function takes the open store, the ids of the exported assets and the `ExportOptions`, and
 returns a `Writer`.
 """
+
+_REPEATED = ("manifest", "resolution", "material_classes", "property_columns", "property_units",
+             "latents", "normalization")  # fmt: skip
+"""Attributes of a store that an export repeats."""
 
 _Entry = dict[str, Any]
 """The entry of an asset in the index of an export: id, columns, file, number of points."""
@@ -167,17 +171,10 @@ def _entry(written: Exported) -> _Entry:
 
 def _about(store: Store, format: str) -> dict[str, Any]:
     """Return the description of the store that every export has, JSON-ready."""
-    attributes = store.attributes
-    return {
+    about = {
         "format": target.FORMAT,
         "format_version": target.FORMAT_VERSION,
         "kind": format,
         "store": store.name,
-        "manifest": attributes["manifest"],
-        "resolution": attributes["resolution"],
-        "material_classes": attributes["material_classes"],
-        "property_columns": attributes["property_columns"],
-        "property_units": [one.unit for one in store.contents.properties],
-        "latents": asdict(store.contents.latents),
-        "normalization": attributes["normalization"],
     }
+    return about | {name: store.attributes[name] for name in _REPEATED}
