@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -20,18 +20,11 @@ import torch
 from numpy.typing import NDArray
 
 from slatprep.errors import InputError
-from slatprep.learn.decoder import SIZES, PhysicsDecoder, make_decoder
+from slatprep.learn.decoder import PhysicsDecoder, make_decoder
 from slatprep.learn.runs import BEST, read_state
 from slatprep.normalize import denormalize_properties
 from slatprep.readers.files import refusing
-from slatprep.records import (
-    PIXIEVERSE,
-    Contents,
-    Normalization,
-    StructuredLatents,
-    labels_of,
-    one_of,
-)
+from slatprep.records import PIXIEVERSE, Contents, Normalization, StructuredLatents, labels_of
 from slatprep.storage.atomic import staged
 from slatprep.storage.documents import read_as
 from slatprep.storage.files import file_digest, file_name
@@ -41,13 +34,28 @@ BATCH_VOXELS = 65_536
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """A trained decoder: model, ranges, latents and properties, and the digest of its file."""
+class _About:
+    """What a checkpoint says of its decoder beside the weights, as one JSON text."""
 
-    model: PhysicsDecoder
     size: str
     normalization: Normalization
     contents: Contents
+
+    def __post_init__(self) -> None:
+        labels_of(self.contents.classes)
+        if [(p.name, p.log10) for p in self.contents.properties] != [
+            (span.name, span.log10) for span in self.normalization.ranges
+        ]:
+            raise ValueError("ranges and properties differ")
+        if not all(-np.inf < s.lo < s.hi < np.inf for s in self.normalization.ranges):
+            raise ValueError(f"ranges are {self.normalization.spans.tolist()}")
+
+
+@dataclass(frozen=True)
+class Checkpoint(_About):
+    """A trained decoder: model, ranges, latents and properties, and the digest of its file."""
+
+    model: PhysicsDecoder
     sha256: str
     device: str
 
@@ -78,24 +86,6 @@ class PredictedField:
     material: NDArray[np.uint8]
     probabilities: NDArray[np.float32]
     seconds: float
-
-
-@dataclass(frozen=True)
-class _About:
-    """What a checkpoint says of its decoder beside the weights, as one JSON text."""
-
-    size: Annotated[str, one_of(*SIZES)]
-    normalization: Normalization
-    contents: Contents
-
-    def __post_init__(self) -> None:
-        labels_of(self.contents.classes)
-        if [(p.name, p.log10) for p in self.contents.properties] != [
-            (span.name, span.log10) for span in self.normalization.ranges
-        ]:
-            raise ValueError("ranges and properties differ")
-        if not all(-np.inf < s.lo < s.hi < np.inf for s in self.normalization.ranges):
-            raise ValueError(f"ranges are {self.normalization.spans.tolist()}")
 
 
 def checkpoint_state(
@@ -136,7 +126,7 @@ def load_checkpoint(path: Path, device: str = "cpu") -> Checkpoint:
         if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
             raise ValueError("weights are not all finite")
     model.to(device).eval()
-    return Checkpoint(model=model, **vars(about), sha256=file_digest(path), device=device)
+    return Checkpoint(**vars(about), model=model, sha256=file_digest(path), device=device)
 
 
 def predict(
