@@ -10,7 +10,8 @@ import math
 import os
 import pickletools
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -107,43 +108,39 @@ def _check_globals(pickled: bytes) -> None:
             raise ValueError(f"it names {name[:80]!r}")
 
 
-class Run:
-    """The folder of a training run; as a context manager it holds the folder's lock.
+@contextmanager
+def open_run(path: Path) -> Iterator[Run]:
+    """Hold the lock of the folder of a training run.
 
-    The folder is new, empty, or holds a run, whose `parameters` are read. ConfigError if it holds
+    The folder is new, empty, or holds a run, whose parameters are read. ConfigError if it holds
     something else, StoreError if another process trains into it.
     """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.parameters: dict[str, Any] = {}
-
-    def __enter__(self) -> Run:
-        file = self.path / RUN_FILE
-        # An empty lock file may be the user's, so it is not deleted afterwards.
-        lock = self.path / _LOCK
-        self._foreign = lock.is_file() and not lock.stat().st_size
-        self._lock = take_lock(self.path / _LOCK, f"{self.path}: another training is writing it")
-        try:
-            # Checked only under the lock: another training may have changed the folder before.
-            if file.exists():
-                with refusing(file, "cannot be read", "what `slatprep train` wrote"):
-                    self.parameters = read_document(file, RUN_BYTES)
-            elif any(path.name not in (_LOCK, _PARTIAL) for path in self.path.iterdir()):
-                raise ConfigError(
-                    f"{self.path} is not empty and holds no run; choose another --out"
-                )
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._foreign:
-            os.ftruncate(self._lock, 0)
+    file, lock, parameters = path / RUN_FILE, path / _LOCK, dict[str, Any]()
+    # An empty lock file may be the user's, so it is not deleted afterwards.
+    foreign = lock.is_file() and not lock.stat().st_size
+    held = take_lock(lock, f"{path}: another training is writing it")
+    try:
+        # Checked only under the lock: another training may have changed the folder before.
+        if file.exists():
+            with refusing(file, "cannot be read", "what `slatprep train` wrote"):
+                parameters = read_document(file, RUN_BYTES)
+        elif any(there.name not in (_LOCK, _PARTIAL) for there in path.iterdir()):
+            raise ConfigError(f"{path} is not empty and holds no run; choose another --out")
+        yield Run(path, parameters)
+    finally:
+        if foreign:
+            os.ftruncate(held, 0)
         else:
-            (self.path / _LOCK).unlink(missing_ok=True)
-        os.close(self._lock)
+            lock.unlink(missing_ok=True)
+        os.close(held)
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The folder of a training run, and the parameters that it has; empty if it is new."""
+
+    path: Path
+    parameters: dict[str, Any]
 
     def begin(self, parameters: dict[str, Any], assignment: Assignment) -> None:
         """Write the parameters of a new run, or continue a run with the same parameters.

@@ -28,7 +28,7 @@ from slatprep.learn.predict import (
     write_prediction,
 )
 from slatprep.learn.predictions import PREDICTIONS
-from slatprep.learn.runs import BEST, LAST, EpochRecord, Run
+from slatprep.learn.runs import BEST, LAST, EpochRecord, open_run
 from slatprep.learn.splits import assign_store
 from slatprep.readers.files import refusing
 from slatprep.readers.splits import HASH, Assignment, Shares, Split
@@ -174,7 +174,7 @@ def train(
             "there is no object to validate on, by which the best weights would be chosen; "
             "expected --keep last, or objects to validate on (--shares, or a list val)"
         )
-    with Run(out) as run:
+    with open_run(out) as run:
         if parameters.precision == "auto":
             # A resumed run keeps its precision, on whatever processor it continues.
             known = run.parameters.get("precision") or precision_of(device)

@@ -22,7 +22,7 @@ from slatprep.learn import train as module
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
 from slatprep.learn.metrics import fit_baselines
-from slatprep.learn.runs import BEST, LAST, Run
+from slatprep.learn.runs import BEST, LAST, Run, open_run
 from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
 from slatprep.readers.splits import Assignment, Shares, split_of
 from slatprep.storage.atomic import take_lock
@@ -283,10 +283,10 @@ def test_commands_train_and_evaluate(learn_store, tmp_path):
 
 def test_a_run_is_trained_by_one_process_at_a_time(tmp_path, monkeypatch):
     (tmp_path / ".lock").touch()  # An empty file of that name stays as it was.
-    with Run(tmp_path):
+    with open_run(tmp_path):
         assert (tmp_path / ".lock").stat().st_size
         told = rf"another training .* \(process {os.getpid()} on"
-        with pytest.raises(StoreError, match=told), Run(tmp_path):
+        with pytest.raises(StoreError, match=told), open_run(tmp_path):
             pass
     assert (tmp_path / ".lock").read_bytes() == b""
 
@@ -296,7 +296,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(tmp_path, monkeypatch):
         return take_lock(path, taken)
 
     monkeypatch.setattr("slatprep.learn.runs.take_lock", late)
-    with Run(tmp_path / "run") as run:  # What another wrote before the lock was ours is read.
+    with open_run(tmp_path / "run") as run:  # What another wrote before the lock was ours is read.
         assert run.parameters == {"seed": 7}
     assert not (tmp_path / "run/.lock").exists()
 
@@ -305,15 +305,15 @@ def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(tmp_path, monkeyp
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with monkeypatch.context() as patched, Run(tmp_path / "run") as run:
+    with monkeypatch.context() as patched, open_run(tmp_path / "run") as run:
         patched.setattr("slatprep.storage.atomic.flush", full)
         with pytest.raises(OSError, match="No space left"):
             run.begin({"seed": 7}, Assignment({}))
         assert not (tmp_path / "run/run.json").exists()
     (tmp_path / "run/.run.json.partial").write_text("{")  # As a killed training leaves it.
-    with Run(tmp_path / "run") as run:
+    with open_run(tmp_path / "run") as run:
         run.begin({"seed": 7}, Assignment({}))
-    with Run(tmp_path / "run") as run:
+    with open_run(tmp_path / "run") as run:
         assert run.parameters.keys() == {"seed", "splits"}
 
 
