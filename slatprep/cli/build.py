@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from slatprep.cli import options
-from slatprep.cli.info import show_errors, show_quality
+from slatprep.cli.info import show_quality, show_sentences
 from slatprep.cli.output import DONE, Output, say
 from slatprep.cli.signature import Click, command
 from slatprep.errors import amount
@@ -360,11 +360,12 @@ def report(output: Output, summary: BuildSummary) -> None:
     def show() -> None:
         if summary.store is not None:
             from slatprep.inspect.overview import list_assets, overview_of
+            from slatprep.pipeline.measured import told_of
 
             store, built = options.opened(summary.store), output.command == "build-store"
             # Advice on dataset definitions is of no use to `subset` and `concat`.
             show_quality(output, overview_of(store), summary.store, advise=built)
-            show_errors(store)
+            show_sentences("wrong pairs", told_of(store))
             if output.verbosity > 0:
                 names = ("asset_id", "verdict", "confidence", "fitness")
                 rows = map(attrgetter(*names), list_assets(store))

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from slatprep.inspect.overview import StoreOverview
     from slatprep.inspect.statistics import Distribution, GroupStatistics, StoreStatistics
     from slatprep.records import Place
-    from slatprep.store import Store
 
 
 @command()
@@ -34,7 +33,7 @@ def info(output: Output, store: options.LastStore) -> None:
     from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)
-    overview, unusual = overview_of(opened), stored_oddities(opened)
+    overview, errors, unusual = overview_of(opened), told_of(opened), stored_oddities(opened)
 
     def show() -> None:
         contents: dict[str, Cell] = {
@@ -50,8 +49,8 @@ def info(output: Output, store: options.LastStore) -> None:
         }
         output.record(f"Store {store}", contents)
         show_quality(output, overview, store)
-        show_errors(opened)
-        show_unusual(unusual)
+        show_sentences("wrong pairs", errors)
+        show_sentences("unusual", unusual)
         output.table(
             f"Normalisation to [-1, 1] (ranges: {overview.normalization.source})",
             ("property", "scale", "lo", "hi"),
@@ -61,7 +60,7 @@ def info(output: Output, store: options.LastStore) -> None:
             ],
         )
 
-    told = {"store": store, "errors": told_of(opened), "unusual": unusual}
+    told = {"store": store, "errors": errors, "unusual": unusual}
     output.result(vars(overview) | told, show)
 
 
@@ -104,18 +103,10 @@ def show_quality(
         say(f"look:    slatprep check-alignment --ambiguous --store {store}")
 
 
-def show_errors(store: Store) -> None:
-    """Print how many of a store's verdicts are wrong, as measured on decoys."""
-    from slatprep.pipeline.measured import told_of
-
-    for sentence in told_of(store):
-        say(f"wrong pairs: {sentence}")
-
-
-def show_unusual(sentences: Iterable[str]) -> None:
-    """Print what is unusual about the sources of a store."""
+def show_sentences(what: str, sentences: Iterable[str]) -> None:
+    """Print sentences on a store, each after what they are about."""
     for sentence in sentences:
-        say(f"unusual: {sentence}")
+        say(f"{what}: {sentence}")
 
 
 def _source_of_categories(overview: StoreOverview) -> str:
@@ -164,7 +155,7 @@ def list_assets(
     slatprep list data/demo.zarr --category tree --ids
     """
     from slatprep.inspect.overview import list_assets as listed_of
-    from slatprep.pipeline.measured import errors_of
+    from slatprep.pipeline.measured import errors_of, told_of
     from slatprep.pipeline.notices import stored_oddities
 
     opened = options.opened(store)
@@ -183,8 +174,8 @@ def list_assets(
         title = f"{len(listed):,} of {len(opened):,} assets"
         output.table(title, ("id", *columns, "why"), rows)
         if listed and errors_of(opened):
-            show_errors(opened)
-        show_unusual(unusual)
+            show_sentences("wrong pairs", told_of(opened))
+        show_sentences("unusual", unusual)
 
     output.result({"store": store, "assets": listed, "unusual": unusual}, show)
 
