@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
 from slatprep.geometry.frames import displacement, voxel_centres
+from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import denormalize_properties
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import RESOLUTION, Place
@@ -318,10 +319,8 @@ def _compare(
     sides = [store.contents.latents.resolution for store in (a, b)]
     order = sides[0] == sides[1] and np.array_equal(*coords)
     if not order:
-        codes = [
-            own.astype(np.int64) @ (1 << 40, 1 << 20, 1) + (side << 50)
-            for own, side in zip(coords, sides, strict=True)
-        ]
+        pairs = zip(coords, sides, strict=True)
+        codes = [flat_index(own, 256) + (side << 24) for own, side in pairs]
         found, mine, theirs = np.intersect1d(codes[0], codes[1], return_indices=True)
         one = {name: values[mine] for name, values in one.items()}
         other = {name: values[theirs] for name, values in other.items()}
