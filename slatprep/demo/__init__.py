@@ -17,7 +17,7 @@ from typing import Any
 from slatprep.demo import write
 from slatprep.demo.asset import DemoAsset, make_asset
 from slatprep.demo.difficulty import LEVELS, SAME_SHAPE_LEVELS
-from slatprep.demo.latents import GRIDS, Encoder, LatentKind
+from slatprep.demo.latents import SPACES, Encoder, LatentKind
 from slatprep.demo.sources import (
     ONE_FRAME,
     TABLE,
@@ -216,18 +216,17 @@ def _claim(root: Path, recipe: _Recipe) -> None:
 
 def _make_one(root: Path, recipe: _Recipe, index: int) -> tuple[int, dict[str, Any]]:
     """Make and write an asset; return its number and its entry in the definition."""
-    channels, resolution = GRIDS[recipe.encoder]
+    space = SPACES[recipe.encoder]
     asset = make_asset(
         recipe.seed, index, levels=recipe.levels, views=recipe.views, latents=recipe.latents,
-        habitual_share=recipe.habitual_share, channels=channels, resolution=resolution,
-        one_frame=recipe.source in ONE_FRAME,
+        habitual_share=recipe.habitual_share, space=space, one_frame=recipe.source in ONE_FRAME,
     )  # fmt: skip
     several = recipe.samples > 1
     grids = write.sample_grids(recipe.seed, index, asset, recipe.samples) if several else None
-    write.write_annotated(root / recipe.adapter, asset, recipe.source, resolution, grids)
+    write.write_annotated(root / recipe.adapter, asset, recipe.source, space.resolution, grids)
     if recipe.results:
         write.write_results(root / "results", asset)
-    write.write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names, recipe.encoder)
+    write.write_slat(root / "slat", asset, recipe.slat_form, recipe.slat_names, space)
     write.write_truth(root / "truth", asset, recipe.source)
     return index, {
         "id": asset.object_id,
@@ -256,9 +255,9 @@ def _write_definition(root: Path, recipe: _Recipe, entries: list[dict[str, Any]]
     if recipe.adapter == "voxels":
         write_description(root / "voxels", TABLE, classes_of(recipe.source))
     if recipe.encoder in ("plain", "plain-128"):
-        channels, resolution = GRIDS[recipe.encoder]
-        space = {"encoder": recipe.encoder, "channels": channels, "resolution": resolution}
-        write_json(root / "encoder.json", space)
+        space = asdict(SPACES[recipe.encoder])
+        named = {name: space[name] for name in ("encoder", "channels", "resolution")}
+        write_json(root / "encoder.json", named)
         slat["encoder"] = "encoder.json"
     elif recipe.encoder != "trellis":
         slat["encoder"] = recipe.encoder

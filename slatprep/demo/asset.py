@@ -23,7 +23,7 @@ from slatprep.demo.shapes import Solid
 from slatprep.demo.voxelise import voxelise
 from slatprep.geometry.frames import nearest_similarity, voxel_centres
 from slatprep.geometry.voxels import boundary
-from slatprep.records import BACKGROUND, RESOLUTION
+from slatprep.records import BACKGROUND, RESOLUTION, TRELLIS, LatentSpace
 
 # Each random choice has a stream of its own, so that one option of the demo
 # does not change the draws of another.
@@ -96,8 +96,7 @@ def make_asset(
     views: int = 1,
     latents: LatentKind = "placeholder",
     habitual_share: float = 0.0,
-    channels: int = 8,
-    resolution: int = RESOLUTION,
+    space: LatentSpace = TRELLIS,
     one_frame: bool = False,
 ) -> DemoAsset:
     """Make asset number `index` of a demo dataset; it depends on these arguments alone.
@@ -116,10 +115,8 @@ def make_asset(
     habitual_share : float
         Share of assets whose PixieVerse side has the dataset's common quarter
         turn; each of the others has any of the 24 quarter turns.
-    channels : int
-        Number of channels of the latents.
-    resolution : int
-        Number of voxels of the SLAT along each axis: 64 times or divided by a power of two.
+    space : LatentSpace
+        The space of the latents; its resolution is 64 times or divided by a power of two.
     one_frame : bool
         Whether both sides come from the same mesh, so that the transform is the identity.
         Allowed only for level 0 and one view.
@@ -161,7 +158,7 @@ def make_asset(
             seen = generate(rng, seen, difficulty.bend, solid, skin)
         rng = np.random.default_rng([seed, index, _LATENTS, v])
         name = f"view_{v}" if views > 1 else ""
-        view = _slat_side(rng, name, solid, seen, latents, channels, resolution)
+        view = _slat_side(rng, name, solid, seen, latents, space)
         made.append(view if difficulty.has_places else replace(view, places=None))
     return DemoAsset(
         object_id(seed, index),
@@ -202,9 +199,9 @@ def _slat_side(
     solid: Solid,
     frames: Frames,
     latents: LatentKind,
-    channels: int,
-    resolution: int,
+    space: LatentSpace,
 ) -> DemoView:
+    resolution = space.resolution
     surface = voxelise(frames.slat_distance(solid), max(resolution, RESOLUTION))[0]
     # The surface meets a coarse voxel if it meets a fine voxel inside.
     fine = len(surface) // resolution
@@ -213,7 +210,7 @@ def _slat_side(
     centres = voxel_centres(coords, resolution)
     material, properties = solid.table()
     stuff = solid.stuff_at(frames.slat_to_object(centres))
-    feats = make_latents(rng, latents, centres, material[stuff], properties[stuff], channels)
+    feats = make_latents(rng, latents, centres, material[stuff], properties[stuff], space)
     places = frames.places(centres)
     # Without a distortion, the truth is the transform of the poses.
     transform = nearest_similarity(places, centres) if frames.distortion else frames.transform()

@@ -1,7 +1,7 @@
-"""Make synthetic latents of a SLAT, with an encoder's number of channels.
+"""Make synthetic latents of a SLAT in the space of an encoder.
 
-Latents with 32 channels have the mean and standard deviation of TRELLIS.2's shape latents;
-others have TRELLIS's, repeated every eight channels. See `slatprep.records.encoders`.
+Latents of a space without moments have TRELLIS's, repeated every eight channels. See
+`slatprep.records.encoders`.
 """
 
 from __future__ import annotations
@@ -11,27 +11,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.records import FEATS_MEAN, FEATS_STD
-from slatprep.records.encoders import SHAPE_MEAN, SHAPE_STD
+from slatprep.records import FEATS_MEAN, FEATS_STD, TRELLIS, LatentSpace
+from slatprep.records.encoders import LATENTS
 
 LatentKind = Literal["placeholder", "material"]
 
 Encoder = Literal["trellis", "sam3d", "trellis2", "trellis2-512", "plain", "plain-128"]
 
-GRIDS: dict[Encoder, tuple[int, int]] = {
-    "trellis": (8, 64),
-    "sam3d": (8, 64),
-    "trellis2": (32, 64),
-    "trellis2-512": (32, 32),
-    "plain": (16, 64),
-    "plain-128": (16, 128),
-}
-"""Number of channels of each encoder's latents, and of voxels along each axis.
+SPACES = {name: LATENTS[name] for name in ("trellis", "sam3d", "trellis2", "trellis2-512")}
+"""The space of each encoder's latents; ``plain`` and ``plain-128`` stand for any other encoder."""
 
-``plain`` and ``plain-128`` stand for any other encoder.
-"""
-
-MEAN, STD = np.array(FEATS_MEAN), np.array(FEATS_STD)
+for _name, _side in (("plain", 64), ("plain-128", 128)):
+    SPACES[_name] = LatentSpace(_name, 16, _side)
 
 NOISE = 0.5
 """Standard deviation of the noise in latents that depend on the material."""
@@ -47,7 +38,7 @@ def make_latents(
     centres: NDArray[np.float64],
     material: NDArray[np.uint8],
     properties: NDArray[np.float32],
-    channels: int = 8,
+    space: LatentSpace = TRELLIS,
 ) -> NDArray[np.float32]:
     """Return latents (N, channels) float32 for SLAT voxels with centres (N, 3) in the unit cube.
 
@@ -55,13 +46,12 @@ def make_latents(
     plus `clean_latents` in the first eight channels. Both are then scaled to the encoder's mean and
     standard deviation. `properties` (N, 3) are Young's modulus, density, Poisson's ratio, SI.
     """
-    z = rng.normal(size=(len(centres), channels))
+    z = rng.normal(size=(len(centres), space.channels))
     if kind == "material":
         z *= NOISE
         z[:, :8] += clean_latents(centres, material, properties)
-    mean, std = np.resize(MEAN, channels), np.resize(STD, channels)
-    if channels == len(SHAPE_MEAN):
-        mean, std = np.array(SHAPE_MEAN), np.array(SHAPE_STD)
+    moments = (space.mean, space.std) if space.mean else (FEATS_MEAN, FEATS_STD)
+    mean, std = (np.resize(one, space.channels) for one in moments)
     return np.asarray((mean + std * z).astype(np.float32))
 
 

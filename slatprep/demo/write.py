@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.demo.asset import DemoAsset, DemoView
-from slatprep.demo.latents import GRIDS, Encoder
 from slatprep.demo.sources import Source, columns_of, write_field, write_hdf5
 from slatprep.geometry.frames import VOXEL_SIZE
 from slatprep.geometry.voxels import shown_in_cells
 from slatprep.normalize import PIXIE_RANGES, normalize_mapped
-from slatprep.records import BACKGROUND, RESOLUTION
+from slatprep.records import BACKGROUND, RESOLUTION, TRELLIS, LatentSpace
 
 SlatForm = Literal["npz", "npz-batch", "hdf5", "hdf5-groups"]
 SlatNames = Literal["id", "sha256"]
@@ -109,12 +108,12 @@ SHAPE_LATENTS = "shape_latents/shape_enc_next_dc_f16c32_fp16"
 
 
 def write_slat(
-    root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames, encoder: Encoder = "trellis"
+    root: Path, asset: DemoAsset, form: SlatForm, names: SlatNames, space: LatentSpace = TRELLIS
 ) -> None:
     """Write the SLATs of an asset below `root`: a file for each, or a group of ``latents.h5``."""
     name = slat_name(asset, names)
-    if encoder.startswith("trellis2"):
-        root /= f"{SHAPE_LATENTS}_{16 * GRIDS[encoder][1]}"
+    if space.encoder.startswith("trellis2"):
+        root /= f"{SHAPE_LATENTS}_{16 * space.resolution}"
     root.mkdir(parents=True, exist_ok=True)
     for view in asset.views:
         stem = root / name / view.view if view.view else root / name

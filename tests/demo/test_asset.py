@@ -15,13 +15,13 @@ from slatprep.demo.asset import make_asset, object_id
 from slatprep.demo.catalogue import CATALOGUE
 from slatprep.demo.difficulty import LEVELS, QUARTER_TURNS, SAME_SHAPE_LEVELS, draw_frames, generate
 from slatprep.demo.generated import draw_distortion
-from slatprep.demo.latents import MEAN, STD
 from slatprep.demo.model import MATERIALS, direction, orient, rock, vessel
 from slatprep.demo.nerf import UNLABELLED, nerf_field
 from slatprep.demo.shapes import Part, Solid, Stuff
 from slatprep.demo.voxelise import voxelise
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import occupancy_of
+from slatprep.records import FEATS_MEAN, FEATS_STD
 
 KINDS = range(2 * len(CATALOGUE))
 """Two turns through the categories: the first two kinds of each."""
@@ -203,7 +203,7 @@ def test_latents_have_the_published_statistics_or_tell_materials_apart(kind):
     made = asset(10, 0, latents=kind)
     feats, material = made.views[0].feats, made.views[0].material
     assert feats.dtype == np.float32
-    centred = (feats - MEAN) / STD
+    centred = (feats - np.array(FEATS_MEAN)) / np.array(FEATS_STD)
     if kind == "placeholder":
         assert np.allclose(centred.mean(axis=0), 0, atol=0.05)
         assert np.allclose(centred.std(axis=0), 1, atol=0.05)

@@ -16,7 +16,7 @@ from support.trees import tree
 
 from slatprep import open_store
 from slatprep.demo import make_asset, make_demo
-from slatprep.demo.latents import GRIDS, Encoder
+from slatprep.demo.latents import SPACES, Encoder
 from slatprep.demo.sources import CLASSES, ONE_FRAME, TABLE, Source, columns_of
 from slatprep.demo.write import MISTAKEN, SPREAD, sample_grids
 from slatprep.errors import ConfigError
@@ -297,7 +297,7 @@ def test_latents_of_every_encoder_are_carried(tmp_path, encoder):
     run_printed(commands.run("make-demo", tmp_path / "demo", *words).output, "a store of it:")
     store = open_store(tmp_path / "demo.zarr")
     assert store.contents.latents.encoder == encoder
-    assert store.contents.latents.channels == GRIDS[encoder][0]
+    assert store.contents.latents.channels == SPACES[encoder].channels
     assert not store.contents.latents.standardised
     (asset,) = store
     (file,) = (tmp_path / "demo" / "slat").rglob("*.npz")
