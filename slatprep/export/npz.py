@@ -154,14 +154,8 @@ def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
     tar.addfile(member, io.BytesIO(content))
 
 
-VOXEL = np.dtype(
-    [
-        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
-        ("youngs_modulus", "<f4"), ("poissons_ratio", "<f4"), ("density", "<f4"),
-        ("segment_id", "<U32"),
-    ]
-)  # fmt: skip
-"""The fields of a voxel: centre in the unit cube, E in Pa, density in kg/m^3, name of class."""
+NUMBERS = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density")
+"""The numbers of a voxel: centre in the unit cube, E in Pa, density in kg/m^3."""
 
 FOLDER = "voxels"
 
@@ -177,8 +171,8 @@ def write_voxels(points: Points, directory: Path, asset: StoredAsset) -> Exporte
     modulus, density, ratio = there.solid(asset).T
     names = np.array(asset.store.contents.labels)
     # As wide as VoMP's own, unless a name is longer; cut names could become equal.
-    named = np.dtype([*VOXEL.descr[:-1], ("segment_id", np.promote_types("<U32", names.dtype))])
+    segment = "segment_id", np.promote_types("<U32", names.dtype)
     columns = [*there.in_slat.T, modulus, ratio, density, names[there.material]]
-    rows = np.rec.fromarrays(columns, named)
+    rows = np.rec.fromarrays(columns, np.dtype([*((name, "<f4") for name in NUMBERS), segment]))
     name = f"{FOLDER}/{file_name(asset.asset_id)}_with_materials.npz"
     return _write(directory, name, asset, len(rows), {"voxel_data": rows})
