@@ -18,8 +18,6 @@ from slatprep.store import Store
 from slatprep.store.reader import open_again
 from slatprep.store.records import StoredRecords
 
-"""Name of the group of assets whose category is unknown."""
-
 _MEDIANS = ("confidence", "expected_accuracy", "fitness", "inlier_rmse", "fitness_backward",
             "overlap")  # fmt: skip
 
