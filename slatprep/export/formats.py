@@ -178,15 +178,16 @@ class Writer:
     is_export: Callable[[Path], bool] | None = None
 
 
-def one_by_one(write: Callable[[Path, StoredAsset], Exported]) -> Writer:
+WriteOne = Callable[[Path, StoredAsset], Exported]
+"""Writes an asset into a folder."""
+
+
+def one_by_one(write: WriteOne) -> Writer:
     """Return a writer of one file for each asset, which `write` puts into a folder."""
     return Writer(partial(_write_each, write))
 
 
 def _write_each(
-    write: Callable[[Path, StoredAsset], Exported],
-    directory: Path,
-    _number: int,
-    assets: Iterable[StoredAsset],
+    write: WriteOne, directory: Path, _number: int, assets: Iterable[StoredAsset]
 ) -> Iterator[Exported]:
     return (write(directory, asset) for asset in assets)
