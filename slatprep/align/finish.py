@@ -50,7 +50,7 @@ def finish(pair: Pair, poses: Sequence[Pose], rough: bool) -> tuple[list[Pose], 
     If it is deformed or the sides are rough, deform the next ones too, and order all by their
     scores after that. Return the poses, best first, and the fit of the best one.
     """
-    fine = pair.refine(poses, FINE, size_by_slat=rough)
+    fine = pair.refine(poses, FINE._replace(size_by_slat=rough))
     first, *others = pair.distinct(fine)
     best, deformed = _deformed(pair, first, rough)
     if deformed.deformation is None and not (rough and pair.may_deform):
@@ -146,7 +146,7 @@ def _simplest(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Model]:
         return pose, Model(model)
     if abs(pose.similarity.scale - 1.0) < RIGID_IF_SCALE_WITHIN:
         start = replace(pose, similarity=pair.at_scale_one(pose.similarity))
-        (rigid,) = pair.refine([start], FINE, free_scale=False, size_by_slat=rough)
+        (rigid,) = pair.refine([start], FINE._replace(free_scale=False, size_by_slat=rough))
         if rigid.score >= pose.score - RIGID_LOSS:
             return rigid, Model.RIGID
     return pose, Model.SIMILARITY

@@ -23,12 +23,16 @@ from slatprep.parameters import AlignParameters
 class Steps(NamedTuple):
     """How poses are refined: samples per side, and the robust kernel's width at each step.
 
-    Steps end once one moves the object's rim by less than the tolerance. Lengths are in voxels.
+    Steps end once one moves the object's rim by less than the tolerance. Lengths are in voxels. The
+    scale is refined too unless `free_scale` is false or the parameters fix it. See
+    `slatprep.align.solver.solve` for `size_by_slat`.
     """
 
     samples: int
     taus: tuple[float, ...]
     tolerance: float
+    free_scale: bool = True
+    size_by_slat: bool = False
 
 
 COARSE = Steps(100, (8.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0, 2.0), 0.02)
@@ -124,16 +128,10 @@ class Pair:
         shifts = self.slat.centroid - scale * (turns @ self.pixie.centroid)
         return [Pose(Similarity(*pose, scale)) for pose in zip(turns, shifts, strict=True)]
 
-    def refine(
-        self,
-        poses: Sequence[Pose],
-        steps: Steps,
-        free_scale: bool | None = None,
-        size_by_slat: bool = False,
-    ) -> list[Pose]:
+    def refine(self, poses: Sequence[Pose], steps: Steps) -> list[Pose]:
         """Refine each pose on an even subset of the samples; see `slatprep.align.solver.solve`."""
         refined = Poses.of([pose.similarity for pose in poses])
-        fits = self.solve(refined, steps, free_scale, size_by_slat)
+        fits = self.solve(refined, steps)
         return [
             Pose(similarity, 0.5 * (here + back), within, rmse, pose.bonus, pose.standing)
             for pose, similarity, (here, back, within, rmse) in zip(
@@ -141,15 +139,13 @@ class Pair:
             )
         ]
 
-    def solve(
-        self, poses: Poses, steps: Steps, free_scale: bool | None = None, size_by_slat: bool = False
-    ) -> Array:
+    def solve(self, poses: Poses, steps: Steps) -> Array:
         """Refine poses in place, and return their fits (n, 4), as `solver.solve` does."""
         slat, pixie = self.subsets(steps.samples)
         low, high = self.parameters.scale_bounds
         fits: Array = solve(
             slat.samples, pixie.samples, poses, np.array(steps.taus, dtype=np.float64),
-            self.free_scale if free_scale is None else free_scale, size_by_slat,
+            self.free_scale and steps.free_scale, steps.size_by_slat,
             (float(low), float(high)), steps.tolerance,
         )  # fmt: skip
         return fits

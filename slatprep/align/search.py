@@ -48,9 +48,9 @@ RANK_WITHIN, MOST_RANKED = 0.12, 6
 """If the best fit is poor, at most `MOST_RANKED` placements whose score is within `RANK_WITHIN` of
 it are ranked by their score after a trial deformation."""
 
-STRETCH_MANY = 40, (5.0, 4.0, 3.0), 24
-STRETCH_FEW = 160, (3.0, 2.0, 2.0, 1.5), MOST_RANKED
-"""Samples per side, widths of the kernel in voxels, and number of poses kept.
+STRETCH_MANY = Steps(40, (5.0, 4.0, 3.0), 0.0), 24
+STRETCH_FEW = Steps(160, (3.0, 2.0, 2.0, 1.5), 0.0), MOST_RANKED
+"""Steps of affine maps, none of which is spared, and number of poses kept.
 
 If the best fit is poor, all poses halfway through the search of all orientations are stretched. The
 best of them are stretched once more. In 12 of 140 pairs of generated shapes the right placement did
@@ -85,8 +85,7 @@ def search_all(pair: Pair) -> tuple[list[Pose], list[Pose]]:
     for scale in scales:
         # The second set is half as dense, to save time.
         starts = pair.starts(so3_starts(SO3_STARTS)[:: 2 if sets else 1], scale)
-        free = pair.free_scale and not sets
-        halfway = pair.refine(starts, COARSE._replace(taus=begin), free_scale=free)
+        halfway = pair.refine(starts, COARSE._replace(taus=begin, free_scale=not sets))
         sets.append(sorted(halfway, key=lambda pose: -pose.score))
     kept = [pose for some in sets for pose in some[: SO3_KEPT // len(sets)]]
     refined = pair.refine(kept, COARSE._replace(taus=end))
@@ -169,14 +168,12 @@ def stretched(pair: Pair, near: Sequence[Pose], halfway: Sequence[Pose]) -> list
     return pair.distinct([*(s.pose for s in likely if s.pose in near), *similar])
 
 
-def _stretch(
-    pair: Pair, poses: Sequence[Stretched], samples: int, taus: Sequence[float], most: int
-) -> list[Stretched]:
+def _stretch(pair: Pair, poses: Sequence[Stretched], steps: Steps, most: int) -> list[Stretched]:
     """Stretch poses further; return at most `most` distinct ones, best first."""
-    slat, pixie = pair.subsets(samples)
+    slat, pixie = pair.subsets(steps.samples)
     affines = np.array([s.warp.affine for s in poses])
     stretched = Poses.of([s.pose.similarity._replace(offset=s.warp.offset) for s in poses])
-    scores = stretch(slat.samples, pixie.samples, stretched, affines, np.array(taus))
+    scores = stretch(slat.samples, pixie.samples, stretched, affines, np.array(steps.taus))
     order = np.argsort(-scores, kind="stable")
     places = pair.places([poses[k].pose for k in order], affines[order])
     return [

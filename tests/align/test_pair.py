@@ -158,10 +158,9 @@ def test_the_size_of_a_start_is_that_of_the_sides_within_its_bounds():
 def test_scale_is_refined_only_where_it_is_free():
     turn = Rotation.from_euler("x", 4, degrees=True).as_matrix()
     start = Pose(Similarity(turn, np.ones(3), 1.06))
-    for model, free, held in (("auto", None, False), ("auto", False, True),
-                              ("rigid", None, True), ("rigid", True, False)):  # fmt: skip
+    for model, free, held in (("auto", True, False), ("auto", False, True), ("rigid", True, True)):
         pair = pair_of(parameters=AlignParameters(model=model))
-        (found,) = pair.refine([start], Steps(400, (4.0,) * 8, 1e-4), free_scale=free)
+        (found,) = pair.refine([start], Steps(400, (4.0,) * 8, 1e-4, free))
         if held:
             assert found.similarity.scale == 1.06
             continue
@@ -359,7 +358,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squ
     (best, *others), deformed = finish(pair, chosen, rough=True)
     assert deformed.deformation is not None
     assert upright(best) < 10.0
-    fine = pair.refine(chosen, FINE, size_by_slat=True)
+    fine = pair.refine(chosen, FINE._replace(size_by_slat=True))
     # It takes over the score that the best one had, and the others have less.
     assert best.merit == pytest.approx(max(pose.score for pose in fine), abs=0.02)
     assert others
@@ -369,7 +368,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squ
 
 def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(squashed):
     pair, poses = squashed
-    fine = pair.refine(poses, FINE, size_by_slat=True)
+    fine = pair.refine(poses, FINE._replace(size_by_slat=True))
     many = pair.distinct(fine)
     assert len(many) > MOST_CONTESTED + 2
     found, _ = finish(pair, poses, rough=True)
