@@ -7,14 +7,11 @@ centroids of the two sides do not match, and the floor has more surface than the
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slatprep.align.surface import DILATION, Surface, even_choice
 from slatprep.geometry.deformation import GRAIN
-from slatprep.geometry.frames import VOXEL_SIZE, even_directions
+from slatprep.geometry.frames import VOXEL_SIZE, Array, even_directions
 from slatprep.records import Alignment, Ground
-
-Array = NDArray[np.float64]
 
 DIRECTIONS, SAMPLES, VOXELS = 250, 500, 10_000
 """Number of directions in which a layer is searched, of surface samples used for that, and of

@@ -35,23 +35,15 @@ def euler_starts() -> tuple[Start, ...]:
     Only 24 of them are different rotations. The `same_as` of the others is the index of the first
     start with the same rotation. SLAT-Phys, "Physics-to-SLAT Annotation Alignment".
     """
-    cos, sin = (1, 0, -1, 0), (0, 1, 0, -1)
+    from scipy.spatial.transform import Rotation
+
     starts: list[Start] = []
     first: dict[bytes, int] = {}
-    for index, (i, j, k) in enumerate(product(range(4), repeat=3)):
-        turn_x = np.array([[1, 0, 0], [0, cos[i], -sin[i]], [0, sin[i], cos[i]]])
-        turn_y = np.array([[cos[j], 0, sin[j]], [0, 1, 0], [-sin[j], 0, cos[j]]])
-        turn_z = np.array([[cos[k], -sin[k], 0], [sin[k], cos[k], 0], [0, 0, 1]])
-        rotation = turn_z @ turn_y @ turn_x  # integers, hence exact
+    for index, (x, y, z) in enumerate(product((0.0, 90.0, 180.0, 270.0), repeat=3)):
+        turned = Rotation.from_euler("xyz", (x, y, z), degrees=True).as_matrix()
+        rotation = np.rint(turned) + 0.0  # integers, hence exact; the sum is never -0.0
         same_as = first.setdefault(rotation.tobytes(), index)
-        starts.append(
-            Start(
-                index,
-                (90.0 * i, 90.0 * j, 90.0 * k),
-                rotation.astype(np.float64),
-                None if same_as == index else same_as,
-            )
-        )
+        starts.append(Start(index, (x, y, z), rotation, None if same_as == index else same_as))
     return tuple(starts)
 
 

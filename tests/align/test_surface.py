@@ -83,10 +83,15 @@ def test_samples_are_all_lattice_points_of_the_band_with_the_distance_there():
     assert len(index) == in_band.sum()
 
 
-def test_starts_are_scipy_s_euler_rotations():
+def test_starts_turn_about_x_then_y_then_z_and_their_entries_are_whole():
+    turn_x = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    turn_y = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    turn_z = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    power = np.linalg.matrix_power
     for start in euler_starts():
-        expected = Rotation.from_euler("xyz", start.euler_degrees, degrees=True).as_matrix()
-        np.testing.assert_allclose(start.rotation, expected, atol=1e-12)
+        x, y, z = (int(angle) // 90 for angle in start.euler_degrees)
+        expected = (power(turn_z, z) @ power(turn_y, y) @ power(turn_x, x)).astype(np.float64)
+        assert start.rotation.tobytes() == expected.tobytes()
     first = [(0, 0, 0), (0, 0, 90), (0, 0, 180), (0, 0, 270), (0, 90, 0)]
     assert [start.euler_degrees for start in euler_starts()][:5] == first
 
