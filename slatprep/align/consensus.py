@@ -179,5 +179,4 @@ def _mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     ordered = sorted(rotations, key=lambda rotation: rotation.tobytes())
     u, _, v = np.linalg.svd(np.mean(ordered, axis=0))
     sign = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ v)))])
-    rotation: NDArray[np.float64] = u @ sign @ v
-    return rotation
+    return np.asarray(u @ sign @ v)

@@ -163,8 +163,7 @@ class Pair:
         It is measured in the PixieVerse frame.
         """
         places = self.places([*poses, other])
-        distance: Array = np.linalg.norm(places[:-1] - places[-1], axis=1)
-        return distance
+        return np.asarray(np.linalg.norm(places[:-1] - places[-1], axis=1))
 
     def others(self, best: Pose, poses: Sequence[Pose]) -> list[Pose]:
         """Return the distinct poses that do not repeat `best`, whatever their scores."""

@@ -53,8 +53,7 @@ class Residuals:
         """Return whether each sample lies in a block that a trial does not see."""
         low = self.surface.points.min(axis=0) - 1.0
         blocks = np.floor((self._lines.places - low) / BLOCK).astype(np.intp)
-        odd: NDArray[np.bool_] = blocks.sum(axis=1) % 2 == 1
-        return odd
+        return np.asarray(blocks.sum(axis=1) % 2 == 1)
 
     def linearise(self, warp: Warp, tau: float) -> None:
         """Measure all residuals, weighted by the kernel of width `tau`, and their derivatives."""

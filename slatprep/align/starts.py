@@ -108,5 +108,4 @@ def so3_starts(count: int) -> NDArray[np.float64]:
     inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
     alpha, beta = 2.0 * np.pi * s / phi, 2.0 * np.pi * s / psi
     planes = inner * [np.sin(alpha), np.cos(alpha)], outer * [np.sin(beta), np.cos(beta)]
-    rotations: NDArray[np.float64] = Rotation.from_quat(np.concatenate(planes).T).as_matrix()
-    return rotations
+    return np.asarray(Rotation.from_quat(np.concatenate(planes).T).as_matrix())

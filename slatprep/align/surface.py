@@ -79,8 +79,7 @@ class Surface:
     @cached_property
     def centroid(self) -> NDArray[np.float64]:
         """Mean of the surface's samples, in voxels from the cube's centre."""
-        centroid: NDArray[np.float64] = self.points.mean(axis=0)
-        return centroid
+        return np.asarray(self.points.mean(axis=0))
 
     @cached_property
     def size(self) -> float:
@@ -168,5 +167,4 @@ def normals_of(surface: Samples) -> NDArray[np.float64]:
     at = np.rint(surface.columns.T - surface.origin).astype(np.intp) @ strides
     normals = np.stack([flat[at + step] - flat[at - step] for step in strides], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    found: NDArray[np.float64] = normals / np.maximum(length, 1e-6)
-    return found
+    return np.asarray(normals / np.maximum(length, 1e-6))

@@ -64,8 +64,7 @@ class PlaceMap:
         own = abs(float(np.linalg.det(self.transform[:3, :3])))
         if self.deformation is None:
             return np.full(len(points), own)
-        ratios: NDArray[np.float64] = own / abs(np.linalg.det(jacobian(self.deformation, points)))
-        return ratios
+        return np.asarray(own / abs(np.linalg.det(jacobian(self.deformation, points))))
 
     def places(
         self, coords: NDArray[np.integer], resolution: int = RESOLUTION

@@ -22,8 +22,7 @@ def boundary(occupancy: NDArray[np.bool_]) -> NDArray[np.bool_]:
     for step in np.array(padded.strides):
         buried[step:] &= flat[:-step]
         buried[:-step] &= flat[step:]
-    surface: NDArray[np.bool_] = (flat & ~buried).reshape(padded.shape)[1:-1, 1:-1, 1:-1]
-    return surface
+    return np.asarray((flat & ~buried).reshape(padded.shape)[1:-1, 1:-1, 1:-1])
 
 
 def bounding_box(occupancy: NDArray[np.bool_]) -> tuple[slice, slice, slice]:

@@ -218,8 +218,7 @@ def _in_order(values: NDArray[np.float32]) -> NDArray[np.uint32]:
     """Return the bits of floats, changed so that they sort like the floats."""
     # Adding zero turns minus zero into zero.
     bits = np.ascontiguousarray(values + np.float32(0)).view(np.uint32)
-    ordered: NDArray[np.uint32] = np.where(bits >> 31, ~bits, bits | _SIGN)
-    return ordered
+    return np.where(bits >> 31, ~bits, bits | _SIGN)
 
 
 def _of_ranks(ordered: NDArray[Any]) -> NDArray[np.float32]:

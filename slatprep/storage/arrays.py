@@ -62,8 +62,7 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
         self._file.seek(self._first + at)
         if self._file.readinto(data.data) != data.nbytes or _checksum(data) != checksum:  # type: ignore[attr-defined]
             raise StoreError(f"the array {name!r} is damaged")
-        array: NDArray[Any] = data.view(dtype).reshape(shape)
-        return array
+        return np.asarray(data.view(dtype).reshape(shape))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)

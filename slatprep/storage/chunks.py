@@ -107,8 +107,7 @@ class ChunkDecoder:
         count = int(text[:4].view("<u4")[0])
         if count != self.shape[0]:
             raise StoreError(f"it holds {count} strings; expected {self.shape[0]}")
-        strings: NDArray[Any] = VLenUTF8().decode(text)
-        return strings
+        return np.asarray(VLenUTF8().decode(text))
 
 
 def crc32c_holds(data: bytes) -> bool:
