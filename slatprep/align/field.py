@@ -44,15 +44,14 @@ from slatprep.align.pose import Pose, Similarity
 from slatprep.align.quality import compare
 from slatprep.align.search import ranked, repeated, search_all
 from slatprep.align.starts import candidates_of, distinct_starts
-from slatprep.align.surface import surface_of
+from slatprep.align.surface import surface_of, surfaces_of
 from slatprep.align.warp import Warp
-from slatprep.geometry.voxels import above, occupancy_of
+from slatprep.geometry.voxels import above
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
     Engine,
     FitFigures,
-    Ground,
     MaterialField,
     Placement,
     Quality,
@@ -98,7 +97,7 @@ def align(
     field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
 ) -> Alignment:
     """Align by distance fields; see `slatprep.align.align`."""
-    pair = _pair_of(field, latents, parameters)
+    pair = Pair(*surfaces_of(field, latents), parameters)
     found = _alignment(pair, _search(pair))
     return _above_ground(field, pair, found) if HOPELESS < found.score < POOR else found
 
@@ -179,7 +178,7 @@ def refined_at(
     parameters: AlignParameters,
 ) -> Alignment:
     """Finish an alignment's placement as `align` finishes the best one; see `settle.refit`."""
-    pair = _pair_of(field, latents, parameters, alignment.ground)
+    pair = Pair(*surfaces_of(field, latents, alignment.ground), parameters)
     start = Pose(Similarity.of(alignment.transform))
     (best,), deformed = finish(pair, [start], rough=alignment.score < CLEAN)
     return replace(
@@ -203,7 +202,7 @@ def fitted_near(
 
     Return the placement, and by how much it ranks above the alignment once both are deformed.
     """
-    pair = _pair_of(field, latents, parameters, alignment.ground)
+    pair = Pair(*surfaces_of(field, latents, alignment.ground), parameters)
     starts = [
         pose for scale in sorted({pair.size_ratio, 1.0}) for pose in pair.starts([rotation], scale)
     ]
@@ -232,7 +231,7 @@ def lead_of_another(
     beat it by `BEATEN`, or by `BETTER`; from the score `FINE` on none is searched for. If one side
     alone has more than the other, it is not off, and only `BEATEN` counts.
     """
-    pair = _pair_of(field, latents, parameters)
+    pair = Pair(*surfaces_of(field, latents), parameters)
     given = Pose(Similarity.of(transform))
     less, more = sorted((1.0 - quality.fitness, 1.0 - quality.fitness_backward))
     better = BETTER if less > 0.5 * more else 1.0
@@ -256,13 +255,3 @@ def _is_poor(poses: Sequence[Pose]) -> bool:
     score = poses[0].score
     unclear = len(poses) > 1 and score - poses[1].score < CLEAR
     return score < POOR or (score < FAIR and unclear)
-
-
-def _pair_of(
-    field: MaterialField,
-    latents: StructuredLatents,
-    parameters: AlignParameters,
-    ground: Ground | None = None,
-) -> Pair:
-    slat = surface_of(occupancy_of(latents.coords, latents.resolution))
-    return Pair(slat, surface_of(above(field.occupancy, ground)), parameters)

@@ -10,11 +10,10 @@ import numpy as np
 from slatprep.align.agreement import agreement_of, shares_within
 from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
-from slatprep.align.surface import surface_of
+from slatprep.align.surface import surfaces_of
 from slatprep.align.warp import Warp
 from slatprep.geometry.deformation import bending_of, deform
 from slatprep.geometry.frames import VOXEL_SIZE
-from slatprep.geometry.voxels import above, occupancy_of
 from slatprep.records import Alignment, Deformation, FitFigures, MaterialField, StructuredLatents
 
 FIT_SAMPLES = 1_200
@@ -34,10 +33,8 @@ def measure_figures(
     A deformation of the alignment is ignored. The offset is the median of the residuals, limited to
     2 voxels.
     """
-    slat = surface_of(occupancy_of(latents.coords, latents.resolution))
-    pixie = surface_of(above(field.occupancy, alignment.ground))
-    pose = Similarity.of(alignment.transform)
-    residuals = Residuals(slat, pixie, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
+    sides, pose = surfaces_of(field, latents, alignment.ground), Similarity.of(alignment.transform)
+    residuals = Residuals(*sides, pose, CHECK_SAMPLES, first=FIT_SAMPLES)
     warp = Warp.unbent(pose)
     here, back = residuals.at(warp)
     # The two sides' residuals have the offset with opposite signs.

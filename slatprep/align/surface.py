@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.geometry.voxels import bounding_box, filled
-from slatprep.records import RESOLUTION
+from slatprep.geometry.voxels import above, bounding_box, filled, occupancy_of
+from slatprep.records import RESOLUTION, Ground, MaterialField, StructuredLatents
 
 CENTRE = (RESOLUTION - 1) / 2
 """Index of the cube's centre; positions below are in voxels relative to it."""
@@ -156,6 +156,14 @@ def surface_of(occupancy: NDArray[np.bool_]) -> Surface:
         values=values.astype(np.float64) + DILATION,
         boundary=boundary,
     )
+
+
+def surfaces_of(
+    field: MaterialField, latents: StructuredLatents, ground: Ground | None = None
+) -> tuple[Surface, Surface]:
+    """Return the surfaces of the SLAT and of the field; ground in the field is left out."""
+    slat = surface_of(occupancy_of(latents.coords, latents.resolution))
+    return slat, surface_of(above(field.occupancy, ground))
 
 
 def normals_of(surface: Samples) -> NDArray[np.float64]:

@@ -25,12 +25,12 @@ from numba.core import event
 from slatprep.align import align
 from slatprep.align.deform import deform_if_earned
 from slatprep.align.pose import Similarity
-from slatprep.align.surface import surface_of
+from slatprep.align.surface import surfaces_of
 from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError, in_unicode
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.kernel import KEPT
-from slatprep.geometry.voxels import occupancy_of, voxels_of
+from slatprep.geometry.voxels import voxels_of
 from slatprep.judge import judge
 from slatprep.parameters import AlignParameters, BuildParameters, SampleParameters
 from slatprep.pipeline.annotate import annotate, process_several
@@ -242,7 +242,6 @@ def _process_a_bent_shape() -> None:
 def _compile_others() -> None:
     """Deform and sample without a search, whose kernels take as long to compile as all others."""
     field, latents = _bent_shape()
-    sides = surface_of(occupancy_of(latents.coords)), surface_of(field.occupancy)
-    parameters = AlignParameters(model="deformable")
+    sides, parameters = surfaces_of(field, latents), AlignParameters(model="deformable")
     deform_if_earned(*sides, Similarity(np.eye(3), np.zeros(3), 1.0), Model.SIMILARITY, parameters)
     sample(field, voxel_centres(latents.coords), SampleParameters())
