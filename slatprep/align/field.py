@@ -32,14 +32,7 @@ from slatprep.align.figures import measure_figures
 from slatprep.align.finish import as_free, finish, rank_of
 from slatprep.align.ground import GROUND_GAIN, LEAST_ABOVE, RAISED, find_layers, gain, raised
 from slatprep.align.mirror import mirror_gain
-from slatprep.align.pair import (
-    COARSE,
-    DISTINCT,
-    MOST_SURVIVORS,
-    POLISH,
-    TIE,
-    Pair,
-)
+from slatprep.align.pair import COARSE, DISTINCT, MOST_SURVIVORS, POLISH, TIE, Pair
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.quality import compare
 from slatprep.align.search import ranked, repeated, search_all

@@ -104,9 +104,7 @@ def make_transform(
     return transform
 
 
-def split_transform(
-    transform: ArrayLike,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def split_transform(transform: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Split a similarity transform into rotation (3, 3), translation (3,) and scale.
 
     Raise ValueError if the matrix is not 4x4, not finite, mirrors, or is no similarity.

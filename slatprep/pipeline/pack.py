@@ -57,11 +57,7 @@ _CLIPPED = {"voxel": "clipped", "grid": "clipped_grid"}
 
 
 def pack_store(
-    work: Work,
-    place: Destination,
-    new: NextStore,
-    jobs: Jobs,
-    progress: Progress | None = None,
+    work: Work, place: Destination, new: NextStore, jobs: Jobs, progress: Progress | None = None
 ) -> frozenset[int]:
     """Write a store and put it in place; return the shards of records that were taken over.
 

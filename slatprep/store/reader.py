@@ -20,13 +20,7 @@ from slatprep.normalize import denormalize_properties
 from slatprep.records import MaterialField, Place, StructuredLatents, words_of
 from slatprep.storage.documents import bounded, parse_document
 from slatprep.storage.place import Folder, place_of, storage_of
-from slatprep.store.assets import (
-    ASSET_COLUMNS,
-    AssetTable,
-    AttributesError,
-    number_of,
-    other_store,
-)
+from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError, number_of, other_store
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_METADATA_BYTES, MAX_VOXELS
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with

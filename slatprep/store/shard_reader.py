@@ -46,15 +46,9 @@ _COPIED_BYTES = 4 * 2**20
 MAX_CHUNK_BYTES = 256 * 2**20
 """Largest size of an unpacked chunk; a chunk of ``grid/*`` takes 3 MiB."""
 
-BAD_METADATA = (
-    ArithmeticError,  # A fill value beyond its data type.
-    AttributeError,
-    IndexError,
-    KeyError,
-    TypeError,
-    ValueError,
-)
-"""Errors that Python, numpy and zarr-python raise for invalid metadata."""
+BAD_METADATA = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Errors that Python, numpy and zarr-python raise for invalid metadata, such as ArithmeticError for
+a fill value beyond its data type."""
 
 MAX_TEXT = {RECORD_ARRAY: MAX_RECORD_BYTES}
 """Largest mean size of the texts of a chunk [byte], by array, if it is more than a name's."""
