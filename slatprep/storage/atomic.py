@@ -78,8 +78,6 @@ def flush_tree(directory: Path) -> None:
 
 def flush(path: Path) -> None:
     """Flush a file's content, or a directory's names, to the disk."""
-    if path.is_dir() and sys.platform == "win32":
-        return  # Windows cannot open a directory.
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -11,7 +11,6 @@ import hashlib
 import os
 import shutil
 import stat
-import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cached_property
@@ -23,12 +22,9 @@ from urllib.parse import quote
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-_AT = os.open in os.supports_dir_fd
-_NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a writer
-_FOLDER = getattr(os, "O_DIRECTORY", 0)
-_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_NO_WAITING = os.O_NONBLOCK  # a pipe's reader would wait for a writer
 
-OWN_FILE = os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | _NO_LINK | _NO_WAITING
+OWN_FILE = os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | _NO_WAITING
 """Flags to open or create our own file without following links or waiting for pipes."""
 
 
@@ -67,12 +63,10 @@ class LocalFolder:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
-        self._descriptor = os.open(self.path, os.O_RDONLY | _FOLDER) if _AT else None
+        self._descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
 
     def open(self, name: str) -> LocalFile:
         """Open a file for reading, without buffer."""
-        if self._descriptor is None:
-            return LocalFile(os.path.join(self.path, name))  # noqa: PTH118 - the hot path
         return LocalFile(name, opener=self._open_at)
 
     def read(self, name: str, limit: int) -> bytes:
@@ -84,8 +78,8 @@ class LocalFolder:
         return os.open(name, flags | _NO_WAITING, dir_fd=self._descriptor)
 
     def __del__(self) -> None:
-        if getattr(self, "_descriptor", None) is not None:
-            os.close(self._descriptor)  # type: ignore[arg-type]
+        if hasattr(self, "_descriptor"):  # else it could not be opened
+            os.close(self._descriptor)
 
 
 def open_regular(path: Path) -> LocalFile:
@@ -121,8 +115,7 @@ def private_file(path: Path) -> BufferedWriter:
 
 def is_only_ours(state: os.stat_result) -> bool:
     """Return whether a regular file, by its state, belongs to us and has only one name."""
-    user = getattr(os, "geteuid", lambda: state.st_uid)()
-    return stat.S_ISREG(state.st_mode) and state.st_nlink == 1 and state.st_uid == user
+    return stat.S_ISREG(state.st_mode) and state.st_nlink == 1 and state.st_uid == os.geteuid()
 
 
 def is_at(descriptor: int, path: Path) -> bool:
@@ -136,11 +129,9 @@ def is_at(descriptor: int, path: Path) -> bool:
 def locks_alone(descriptor: int) -> bool:
     """Lock an open file unless another process has locked it; return whether that worked.
 
-    The lock ends with the process, however the process ends. Windows has no such lock: always True.
+    The lock ends with the process, however the process ends.
     """
-    if sys.platform == "win32":
-        return True
-    import fcntl
+    import fcntl  # Windows has none; `slatprep.storage.atomic.take_lock` says so.
 
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -9,7 +9,6 @@ adjacent, so this reader reads only them; zarr-python reads the same bytes with 
 from __future__ import annotations
 
 import errno
-import sys
 import threading
 import weakref
 from collections import deque
@@ -271,8 +270,6 @@ _KEYS = ({"name": "default"}, {"name": "default", "configuration": {"separator":
 
 def _most_open() -> int:
     """Return how many shards may stay open: half of what the process may open at most."""
-    if sys.platform == "win32":
-        return OPEN_SHARDS
     import resource
 
     limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
