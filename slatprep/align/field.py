@@ -239,8 +239,7 @@ def lead_of_another(
 
 
 def _figures(pair: Pair, best: Pose, deformed: Deformed, clear_by: float = nan) -> FitFigures:
-    poor = best.score < POOR
-    mirrored = mirror_gain(pair, best.similarity, poor)
+    mirrored = mirror_gain(pair, best.similarity, poor=best.score < POOR)
     return replace(deformed.figures, mirrored=mirrored, clear_by=clear_by)
 
 

@@ -129,8 +129,7 @@ def _kernels(pair: Pair, fit: Deformed) -> tuple[Array, Array]:
 
 def rank_of(similarity: Similarity, figures: FitFigures) -> float:
     """Return a deformed placement's rank: the score of unseen samples less the scale penalty."""
-    score = 0.5 * (figures.score_slat + figures.score_pixieverse)
-    return score - scale_penalty(similarity)
+    return 0.5 * (figures.score_slat + figures.score_pixieverse) - scale_penalty(similarity)
 
 
 def _deformed(pair: Pair, pose: Pose, rough: bool) -> tuple[Pose, Deformed]:

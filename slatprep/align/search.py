@@ -88,8 +88,7 @@ def search_all(pair: Pair) -> tuple[list[Pose], list[Pose]]:
         halfway = pair.refine(starts, COARSE._replace(taus=begin, free_scale=not sets))
         sets.append(sorted(halfway, key=lambda pose: -pose.score))
     kept = [pose for some in sets for pose in some[: SO3_KEPT // len(sets)]]
-    refined = pair.refine(kept, COARSE._replace(taus=end))
-    return refined, sets[0]
+    return pair.refine(kept, COARSE._replace(taus=end)), sets[0]
 
 
 def repeated(pair: Pair, best: Pose) -> list[Pose]:
@@ -156,10 +155,9 @@ def stretched(pair: Pair, near: Sequence[Pose], halfway: Sequence[Pose]) -> list
     first = _stretch(pair, _unstretched(halfway), *STRETCH_MANY)
     found = _stretch(pair, [*_unstretched(near), *first], *STRETCH_FEW)
     likely = [s for s in found if s.score > found[0].score - RANK_WITHIN]
-    points = pair.subsets(POLISH.samples)[0].points
-    bounds = pair.parameters.scale_bounds
+    points = pair.slat.subset(POLISH.samples).points
     similar = [
-        Pose(from_nearest(s.pose.similarity, s.warp, points, bounds)[0])
+        Pose(from_nearest(s.pose.similarity, s.warp, points, pair.parameters.scale_bounds)[0])
         for s in likely
         if s.pose not in near
     ]

@@ -81,8 +81,7 @@ def from_nearest(
     The new similarity's scale stays within the bounds.
     """
     moved = warp.moved(points)
-    transform = nearest_similarity(points, moved)
-    turn, _, grown = split_transform(transform)
+    turn, _, grown = split_transform(nearest_similarity(points, moved))
     low, high = scale_bounds
     grown = pose.scale / float(np.clip(pose.scale / grown, low, high))
     centre, there = points.mean(axis=0), moved.mean(axis=0)

@@ -65,8 +65,7 @@ def look_up(
     if judgement is None:
         judgement, likely = judge(field, latents, alignment, annotation, parameters)
     else:
-        confidence = judgement.confidence
-        likely = voxel_confidence(field, latents, alignment, annotation, confidence)
+        likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
     return replace(annotation, confidence=likely), judgement
 
 

@@ -234,8 +234,7 @@ def _process_a_bent_shape() -> None:
     """Align, sample and judge the bent shape, once per process."""
     field, latents = _bent_shape()
     alignment = align(field, latents, AlignParameters(model="deformable"))
-    places = map_of(alignment).places(latents.coords)
-    annotation = sample(field, places, SampleParameters())
+    annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
     judge(field, latents, alignment, annotation, SampleParameters())
 
 

@@ -144,8 +144,7 @@ class Before:
         seed = time.time_ns() if seed is None else seed
         ids = sorted(self.known)
         drawn = set(random.Random(seed).sample(ids, math.ceil(share * len(ids))))
-        recipe = self.wanted.recipe
-        tasks = [(pair, recipe) for pair in self.pairs if pair.asset_id in drawn]
+        tasks = [(pair, self.wanted.recipe) for pair in self.pairs if pair.asset_id in drawn]
         keys = run_unordered(key_of, tasks, crew.of(len(tasks)))
         self.unnoticed = tuple(sorted(one for one, key in keys if key != self.known[one][1]))
         self.seed = seed if drawn else None
@@ -213,8 +212,7 @@ def _store_state(place: Destination, manifests: Place, assets: int, wait: bool =
 
 def _seen_folder(place: Destination) -> Path:
     """Return the folder for what a build saw: that of the records, if it is on a local disk."""
-    folder = storage_of(place.manifests()).local
-    return folder or storage_of(place.store).work_folder().parent
+    return storage_of(place.manifests()).local or storage_of(place.store).work_folder().parent
 
 
 def key_of(pair: AssetPair, recipe: Recipe) -> tuple[str, str]:

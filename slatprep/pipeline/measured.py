@@ -168,8 +168,7 @@ def file_of(store: Place) -> Place:
 def measured_errors(store: Place) -> MeasuredErrors | None:
     """Return the last measurement of a store, perhaps from before an update; None if none."""
     try:
-        text = read_bounded(file_of(store), _MAX_BYTES)
-        return read_as(MeasuredErrors, text)
+        return read_as(MeasuredErrors, read_bounded(file_of(store), _MAX_BYTES))
     except (OSError, ValueError):
         return None  # The errors are measured anew.
 

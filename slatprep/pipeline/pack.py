@@ -159,8 +159,7 @@ def arrays_in(group: str, merged: bool) -> list[str]:
     """Return the full names of a group's arrays that are cut into shards."""
     if group == "record":
         return [RECORD_ARRAY]
-    layouts = arrays_with(merged)
-    return [layout.name for layout in layouts if layout.name.startswith(f"{group}/")]
+    return [one.name for one in arrays_with(merged) if one.name.startswith(f"{group}/")]
 
 
 def _follows(where: Where, asset: int) -> tuple[int, int] | None:

@@ -194,11 +194,9 @@ def plan_asset(pair: AssetPair, context: BuildContext) -> PlannedAsset:
         try:
             sources, digests = hash_sources(pair)
         except SlatprepError as error:
-            missing = isinstance(error, MissingPartnerError)
-            action = Action.SKIP if missing else Action.REFUSE
+            action = Action.SKIP if isinstance(error, MissingPartnerError) else Action.REFUSE
             return PlannedAsset(pair.asset_id, action, " ".join(str(error).split()))
-    planned = _planned(pair, sources, digests, context)
-    return replace(planned, seen=as_read(pair, noted))
+    return replace(_planned(pair, sources, digests, context), seen=as_read(pair, noted))
 
 
 def _planned(

@@ -140,8 +140,7 @@ class Spool:
     def record_text(self, key: str) -> bytes:
         """Read an asset's record back as its JSON, unchecked."""
         with self._open(key) as arrays:
-            text: bytes = arrays["record"].tobytes()
-        return text
+            return arrays["record"].tobytes()
 
     def voxels(self, key: str) -> Arrays:
         """Read an asset's rows of the ``voxel/*`` arrays, properties in SI units."""

@@ -46,8 +46,7 @@ def contents_of(parameters: BuildParameters) -> Contents:
     held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
     for number, source in enumerate(parameters.also, 1):
         other = source_adapter(source.adapter).describe(source)
-        fault = _disagreement(other, held)
-        if fault:
+        if fault := _disagreement(other, held):
             raise ConfigError(
                 f"[[also]] {number} ({source.root}): {fault}; expected what [pixieverse] has, or "
                 "a part of it: name the source that has most as [pixieverse]"

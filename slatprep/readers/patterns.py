@@ -165,8 +165,7 @@ def _walk(
     except OSError as error:
         if not prefix:
             raise
-        problem = f"{error.filename}: cannot be listed ({error.strerror})"
-        yield Found(known, prefix, problem)
+        yield Found(known, prefix, f"{error.filename}: cannot be listed ({error.strerror})")
         return
     texts, variables = _split(component, known)
     for name in listed:

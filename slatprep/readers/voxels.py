@@ -115,8 +115,7 @@ class PlainVoxels(SourceAdapter):
         # Unlike a grid and a prediction, two forms of an object are equal, and none precedes.
         patterns, chosen = patterns_of(self, source), chosen_sample(source)
         for found in find_by_pattern(patterns, listing, chosen, first=False):
-            path = found.path.removesuffix(_GROUP)
-            yield replace(found, path=path, beside=(DESCRIPTION,))
+            yield replace(found, path=found.path.removesuffix(_GROUP), beside=(DESCRIPTION,))
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
@@ -253,7 +252,6 @@ def _group_arrays(
 
 
 _VOMP = {"voxel_data": files.ArraySpec(shapes=((None,),), kinds="V")}
-_VOMP_SIDE = 64
 
 
 class VoMP(SourceAdapter):
@@ -287,9 +285,8 @@ class VoMP(SourceAdapter):
         return field_of_voxels(
             path,
             # The dataset states lower corners, i / 64 - 0.5; predictions state centres.
-            np.floor((positions + 0.5) * _VOMP_SIDE + 0.25).astype(np.int64),
+            np.floor((positions + 0.5) * records.RESOLUTION + 0.25).astype(np.int64),
             np.stack([rows[name] for name in columns], axis=1),
-            resolution=_VOMP_SIDE,
             max_unphysical=max_unphysical,
             sources=(file,),
             frame=np.eye(4),

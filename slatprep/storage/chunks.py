@@ -60,8 +60,7 @@ class ChunkDecoder:
         """
         text = max_text if dtype.hasobject else 0
         first, rest = codecs[0], [codec["name"] for codec in codecs[1:]]
-        little = first.get("configuration", {}).get("endian", "little") == "little"
-        if not little:
+        if first.get("configuration", {}).get("endian", "little") != "little":
             raise ValueError("it is big-endian")
         if first["name"] == ("vlen-utf8" if text else "bytes"):
             crc32c = rest[-1:] == ["crc32c"]

@@ -176,8 +176,7 @@ def finish_store(
     import zarr
 
     root = open_for_writing(path)
-    ids = root["asset/id"][:]
-    rows = {"manifest": build_id, "segments": segments_of(ids)}
+    rows = {"manifest": build_id, "segments": segments_of(root["asset/id"][:])}
     root.attrs.update(store_attributes(normalization, build, contents) | rows)
     _write_coordinates(root, [one.name for one in contents.properties])
     write_digests(path, known, elsewhere)
