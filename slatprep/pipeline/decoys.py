@@ -225,8 +225,7 @@ def draw_decoys(
             next((k for k in side if all(column[k] != own for column, own in alike)), None)
             for side in (smaller, larger)
         )
-        near = [k for k in firsts if k is not None]
-        if near:
+        if near := [k for k in firsts if k is not None]:
             other = min(near, key=lambda k: abs(sizes[k] - sizes[row]))
             drawn.append(Decoy(ids[row], ids[other], (keys[ids[row]], keys[ids[other]])))
     return drawn

@@ -147,8 +147,7 @@ def concat_stores(
         raise ConfigError(f"{len(sources)} stores to join; expected two or more")
     rows = _rows(sources)
     times = Counter(row.asset_id for row in rows)
-    twice = sorted(asset_id for asset_id, count in times.items() if count > 1)
-    if twice:
+    if twice := sorted(asset_id for asset_id, count in times.items() if count > 1):
         raise ConfigError(
             f"{len(twice)} ids are in more than one store, such as {', '.join(twice[:3])}; "
             "expected each once: leave them out of one with `slatprep subset`"

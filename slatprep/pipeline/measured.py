@@ -192,8 +192,7 @@ def errors_of(store: Store) -> MeasuredErrors | None:
 
 def told_of(store: Store) -> list[str]:
     """Return sentences on what is known of a store's errors, or on why nothing is known."""
-    measured = errors_of(store)
-    if measured is None:
+    if (measured := errors_of(store)) is None:
         if reason := why_no_decoys(store):
             return [f"not measured: {reason}"]
         few = len(store) < LEAST_TARGETS
@@ -211,8 +210,7 @@ def told_of(store: Store) -> list[str]:
 def writable_file(store: Place) -> Place:
     """Return `file_of` a store; raise SlatprepError if a file of other origin is there."""
     file = file_of(store)
-    local = storage_of(file).local
-    if local is not None:
+    if (local := storage_of(file).local) is not None:
         require_beside(local.parent)
         require_free(local, mark=ERRORS)
     return file

@@ -182,8 +182,7 @@ def shared_sources(
         if content:
             found[content].append(at)
     ids, objects = store.ids, store.column("object_id")
-    groups = [own for own in found.values() if len({objects[at] for at in own}) > 1]
-    if groups:
+    if groups := [own for own in found.values() if len({objects[at] for at in own}) > 1]:
         names = [" = ".join(ids[at] for at in own[:4]) for own in groups]
         yield (
             f"{sum(map(len, groups))} assets of different objects share the same {what} "

@@ -98,8 +98,7 @@ def _state_of(pair: AssetPair, state_of: Callable[[Place], Noted]) -> bytes:
     states: list[object] = [boot_id(), names]
     files = _files(pair)
     for file in files:
-        state = state_of(file)
-        if state is None:
+        if (state := state_of(file)) is None:
             return _UNKNOWN
         states.append((str(file), state))
     return hashlib.blake2b(repr(states).encode(), digest_size=16).digest() if files else _UNKNOWN

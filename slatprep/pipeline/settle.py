@@ -133,8 +133,7 @@ def dataset_ranges(
     if isinstance(source, Normalization):
         return source
     chosen, table = _chosen(usable, parameters), wanted.declared.properties
-    percentiles = percentiles_of(parameters.ranges)
-    if percentiles is None:
+    if (percentiles := percentiles_of(parameters.ranges)) is None:
         return ranges_from_extents([asset.columns["extent"] for asset in chosen], source, table)
     keys = list({_field_of(asset): asset.key for asset in reversed(chosen)}.values())
     counts = _counted(spool, keys, jobs, len(table))

@@ -100,8 +100,7 @@ class Spool:
 
     def holds_any(self) -> bool:
         """Return whether any asset is finished."""
-        directory = storage_of(self.directory).local
-        if directory is None:
+        if (directory := storage_of(self.directory).local) is None:
             return any(name.endswith(".arrays") for name in storage_of(self.directory).files())
         return any(directory.glob("[0-9a-f][0-9a-f]/*.arrays"))
 

@@ -118,8 +118,7 @@ class ForeignSource(_Foreign):
         while True:
             # Not around the yield: if the caller stops early, the adapter is not to blame.
             with self._blamed():
-                found = next(every, None)
-                if found is None:
+                if (found := next(every, None)) is None:
                     return
                 texts = found.object_id, found.path, found.sample, found.problem
                 named = all(isinstance(one, str) for one in (*texts, *found.beside))

@@ -161,8 +161,7 @@ def _grids_of(
     source: PixieverseSource, listing: Listing, slat: SlatSource
 ) -> dict[str, list[adapters.FoundField]]:
     """Return the grids by `find_grids`; ConfigError if there are none."""
-    grids = adapters.find_grids(source, listing)
-    if grids:
+    if grids := adapters.find_grids(source, listing):
         return grids
     tried = _tried_grids(source, {})
     # Only for PixieVerse: files of plain voxels have the same names as SLATs.

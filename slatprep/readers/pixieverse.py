@@ -191,8 +191,7 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
     mask = np.ascontiguousarray(values > 0.5)
     if not mask.any():
         raise InputError(path, "the mask is empty", "an occupied voxel (a value above 0.5)")
-    between = int(np.count_nonzero((values != 0) & (values != 1)))
-    if between:
+    if between := int(np.count_nonzero((values != 0) & (values != 1))):
         warnings.append(f"mask: {between} voxels lie between 0 and 1; above 0.5 is occupied")
     return mask
 

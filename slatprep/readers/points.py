@@ -99,8 +99,7 @@ def _with_counts(lines: list[bytes], counts: list[int]) -> bytes:
     left = iter(counts)
     for line in lines[:-1]:
         if line.startswith(b"element "):
-            rows = next(left, None)
-            if rows is None:
+            if (rows := next(left, None)) is None:
                 break
             line = b" ".join([*line.split()[:2], b"%d" % rows, *line.split()[3:]])
             line += lines[0].removeprefix(b"ply")

@@ -55,8 +55,7 @@ def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = 
             return _tree(root.parent, [root.name], wanted, str(root), note)
         for _ in range(3):
             files, folders = storage_of(root).names()
-            archives = sorted(name for name in files if is_archive(name))
-            if archives:
+            if archives := sorted(name for name in files if is_archive(name)):
                 packed = (name for name in files if name.lower().endswith(_PACKED))
                 beside = sorted(n for n in (*folders, *packed) if not n.startswith("."))
                 if note and beside:

@@ -67,8 +67,7 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
 def pixie_ranges(table: Sequence[Property]) -> Normalization:
     """Return Pixie's published ranges of the properties; ConfigError if one has none."""
     published = {one.name: one for one in PIXIE_RANGES.ranges}
-    unknown = [one.name for one in table if one.name not in published]
-    if unknown:
+    if unknown := [one.name for one in table if one.name not in published]:
         raise ConfigError(
             f"normalize.ranges: Pixie publishes no range of {unknown[0]}; expected 'dataset', or a "
             "file with a range of each property"

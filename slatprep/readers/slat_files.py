@@ -126,8 +126,7 @@ def slat_patterns(source: SlatSource) -> tuple[str, ...]:
     usual = SlatSource.pattern
     if source.pattern != usual:
         return source.pattern
-    space = LATENTS.get(source.encoder)
-    if space is None:
+    if (space := LATENTS.get(source.encoder)) is None:
         own: tuple[str, ...] = getattr(latent_adapter(source.encoder), "patterns", ())
         return own or usual
     if not space.encoder.startswith("trellis2"):

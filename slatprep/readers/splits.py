@@ -73,8 +73,7 @@ def split_objects(object_ids: Iterable[str], shares: Shares = Shares()) -> dict[
         if share == 0 or split in splits.values():
             continue
         counts = Counter(splits.values())
-        spare = [object_id for object_id, other in splits.items() if counts[other] > 1]
-        if spare:
+        if spare := [object_id for object_id, other in splits.items() if counts[other] > 1]:
             middle = low + share / 2
             splits[min(spare, key=lambda object_id: abs(position_of(object_id) - middle))] = split
     return splits
@@ -182,8 +181,7 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
             raise InputError(path, f"has a list {name[:80]!r}", f"some of {', '.join(SPLITS)}")
         if not isinstance(ids, list):
             raise InputError(path, f"holds {type(ids).__name__} for {name}", _FORMS)
-        wrong = [one for one in ids if not isinstance(one, str)]
-        if wrong:
+        if wrong := [one for one in ids if not isinstance(one, str)]:
             raise InputError(path, f"{name} has {str(wrong[0])[:80]!r}, which is no text", _FORMS)
     if not any(lists.values()):
         raise InputError(path, "has no id", _FORMS)

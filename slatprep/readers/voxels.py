@@ -163,8 +163,7 @@ def _ply_arrays(
 ) -> dict[str, NDArray[Any]]:
     vertices, _ = ply_points(data, where)
     names = set(vertices.dtype.names or ())
-    missing = [name for name in specs if name != "voxels" and name not in names]
-    if missing:
+    if missing := [name for name in specs if name != "voxels" and name not in names]:
         raise InputError(where, f"has no property {missing[0]!r}", "one for each of source.json")
     arrays = {name: vertices[name] for name in specs if name != "voxels"}
     arrays["voxels"] = np.stack([vertices[axis] for axis in "xyz"], axis=1)

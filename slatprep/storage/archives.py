@@ -116,8 +116,7 @@ class Archive:
         data = self._kept(entry) if self.keeps else None
         if data is None and self.packed:
             _extend(self, Index())
-            data = self._kept(entry)
-            if data is None:
+            if (data := self._kept(entry)) is None:
                 raise self.replaced()
         if data is None:
             data = self.checked(entry, self.range(entry.size + BLOCK, entry.offset - BLOCK))

@@ -31,8 +31,7 @@ VARIABLE = "SLATPREP_CACHE"
 
 def cache_folder() -> Path:
     """Return the folder: ``$SLATPREP_CACHE``, else ``slatprep`` in the user's own cache."""
-    named = os.environ.get(VARIABLE)
-    if named:
+    if named := os.environ.get(VARIABLE):
         return Path(named).expanduser().absolute()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "slatprep"
 

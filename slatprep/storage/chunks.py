@@ -249,8 +249,7 @@ def read_chunks(
     for corner in product(*corners):
         places = (start // step for start, step in zip(corner, steps, strict=True))
         key = separator.join(["c", *map(str, places)])
-        data = fetch(key, most)
-        if data is None:
+        if (data := fetch(key, most)) is None:
             missing(key)  # Zarr writes no file of fill values alone.
             continue
         for part, packed in zip(product(*parts), _packed(data, each, sharded), strict=True):

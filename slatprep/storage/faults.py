@@ -22,7 +22,6 @@ VARIABLE = "SLATPREP_FAULTS"
 
 def reached(step: str, name: str = "") -> None:
     """Report that a build reached a step, with the name of the asset or file."""
-    place = os.environ.get(VARIABLE)
-    if place:
+    if place := os.environ.get(VARIABLE):
         module, _, function = place.partition(":")
         getattr(import_module(module), function)(step, name)

@@ -76,8 +76,7 @@ class States:
 
         The file may have been written just before, or be open for writing.
         """
-        found = _statx(file)
-        if found is None:
+        if (found := _statx(file)) is None:
             return None
         if found.mount not in self._counts:
             listed = _statx(file, _BASIC | _MOUNT)

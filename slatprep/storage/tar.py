@@ -136,8 +136,7 @@ class Leaps:
             if leap < window:
                 self._file.held(2 * window, end - BLOCK)
                 break
-            found = self._sought(end + leap, window)
-            if found:
+            if found := self._sought(end + leap, window):
                 self._landed[name] = found - self._first
                 return found
             self._beyond = end + leap

@@ -91,8 +91,7 @@ def refusal(path: Path, what: str) -> StoreError:
 
 
 def _restore(directory: Path, target: Place) -> None:
-    local = storage_of(target).local
-    if local is not None:
+    if (local := storage_of(target).local) is not None:
         restore_directory(directory, local)
 
 

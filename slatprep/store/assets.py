@@ -151,8 +151,7 @@ class AssetTable:
             If the store lacks one of them.
         """
         held = list(self.about.property_columns)
-        missing = [name for name in names if name not in held]
-        if missing:
+        if missing := [name for name in names if name not in held]:
             lacking, there = " and no ".join(missing), ", ".join(held)
             raise StoreError(
                 f"{self.path} has no {lacking}, only {there}; expected a store with "

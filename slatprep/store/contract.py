@@ -87,8 +87,7 @@ def size_findings(name: str, metadata: object, sizes: Mapping[str, int]) -> Iter
     `sizes` are `dimension_sizes`. Arrays outside the contract are not checked. An array without
     findings may be read: reading allocates no more memory than its files account for.
     """
-    layout = LAYOUTS.get(name)
-    if layout is None:
+    if (layout := LAYOUTS.get(name)) is None:
         return
     where = f"{name}/zarr.json"
     if not isinstance(metadata, dict) or metadata.get("node_type") != "array":

@@ -156,8 +156,7 @@ class AssetRecord:
 
     def of_first_pass(self) -> AssetRecord:
         """Return the record as it was before the passes over the whole dataset."""
-        first = self.first_pass
-        if first is None:
+        if (first := self.first_pass) is None:
             return self
         return replace(
             self,

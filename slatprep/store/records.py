@@ -56,8 +56,7 @@ class StoredRecords:
         """Return the record of a row as its JSON, unchecked; StoreError if it cannot be read."""
         chunk, position = divmod(row, RECORDS_IN_CHUNK)
         # Callers ask for rows nearly in order, within each segment.
-        kept = self._chunks.get(chunk)
-        if kept is None:
+        if (kept := self._chunks.get(chunk)) is None:
             start = chunk * RECORDS_IN_CHUNK
             stop = min(start + RECORDS_IN_CHUNK, len(self.store))
             kept = [str(text) for text in self.store.read_rows(RECORD_ARRAY, start, stop)]
