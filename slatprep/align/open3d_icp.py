@@ -70,8 +70,7 @@ def load_open3d() -> Any:
 
         import libusb_package
 
-        library = libusb_package.get_library_path()
-        if library is not None:
+        if (library := libusb_package.get_library_path()) is not None:
             ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
     try:
         import open3d

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from slatprep.align.quality import measure_quality
-from slatprep.geometry.frames import displacement
+from slatprep.geometry.frames import Array, displacement
 from slatprep.parameters import AlignParameters
 from slatprep.records import (
     Alignment,
@@ -41,7 +41,7 @@ def take(
         figures=None,
         score=placement.score,
         margin=math.nan,  # Its score may be below that of the placement that was left.
-        placements=_apart_from(placement, (left, *others), latents),
+        placements=_apart_from(placement.transform, (left, *others), latents),
         settled_by=by,
     )
 
@@ -61,8 +61,7 @@ def refit(
         from slatprep.align.field import refined_at
 
         alignment = refined_at(alignment, field, latents, parameters)
-        placement = Placement(alignment.transform, alignment.score, 0.0)
-        others = _apart_from(placement, alignment.placements, latents)
+        others = _apart_from(alignment.transform, alignment.placements, latents)
         alignment = replace(alignment, placements=others)
     quality = measure_quality(
         field, latents, alignment.transform, parameters.radius, alignment.ground
@@ -71,9 +70,9 @@ def refit(
 
 
 def _apart_from(
-    placement: Placement, others: tuple[Placement, ...], latents: StructuredLatents
+    transform: Array, others: tuple[Placement, ...], latents: StructuredLatents
 ) -> tuple[Placement, ...]:
     return tuple(
-        replace(p, displacement=displacement(p.transform, placement.transform, latents.centres))
+        replace(p, displacement=displacement(p.transform, transform, latents.centres))
         for p in others
     )

@@ -108,8 +108,7 @@ def measure_errors(
         if not os.access(there, os.W_OK):
             raise StoreError(f"{there}: cannot be written to; expected a folder for {file}")
     keys, grids, evidence = _evidence_of(store)
-    wanted = draw_decoys(store, keys, grids, decoys, seed)
-    if not wanted:
+    if not (wanted := draw_decoys(store, keys, grids, decoys, seed)):
         raise StoreError(f"{store.path}: decoys need two objects that share neither grid nor SLAT")
     measured = before or measured_errors(store.path)
     known = {(one.grid, one.slat, one.keys): one for one in measured.decoys} if measured else {}

@@ -304,12 +304,10 @@ class NextStore:
 def column(name: str, rows: Sequence[Row], stores: Sequence[SourceStore]) -> NDArray[Any]:
     """Return an ``asset/*`` array (A, ...) of rows, by last name, as spool and stores hold it."""
     parts: list[tuple[list[int], Any]] = []
-    made = [k for k, row in enumerate(rows) if row.spooled]
-    if made:
+    if made := [k for k, row in enumerate(rows) if row.spooled]:
         parts.append((made, [rows[k].columns[name] for k in made]))
     for number, source in enumerate(stores):
-        at = [k for k, row in enumerate(rows) if row.store == number]
-        if at:
+        if at := [k for k, row in enumerate(rows) if row.store == number]:
             parts.append((at, source.column(name)[[rows[k].row for k in at]]))
     first = np.asarray(parts[0][1])
     values = np.empty(

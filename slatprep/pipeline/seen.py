@@ -24,7 +24,7 @@ from slatprep.records import AssetPair, Place
 from slatprep.storage.arrays import ArrayFile, write_arrays
 from slatprep.storage.files import open_regular, private_file
 from slatprep.storage.place import storage_of
-from slatprep.storage.states import Noted, States, boot_id
+from slatprep.storage.states import Noted, States, boot_id, system_text
 
 NAME = "sources.seen"
 """Name of the file, in the records' folder, or on this disk if the records are elsewhere."""
@@ -66,12 +66,7 @@ def write_seen(folder: Path, bound: bytes, store: bytes, states: Iterable[bytes]
 
 def bound_to(build_id: str, recipe: str) -> bytes:
     """Return a digest of this machine, a build's store and its recipe, for which states hold."""
-    machine = Path("/etc/machine-id")
-    try:
-        name = machine.read_text()
-    except (OSError, UnicodeDecodeError):
-        name = ""
-    parts = [_FORMAT, platform.node(), name, build_id, recipe]
+    parts = [_FORMAT, platform.node(), system_text("/etc/machine-id"), build_id, recipe]
     return hashlib.sha256(orjson.dumps(parts)).digest()
 
 

@@ -120,8 +120,7 @@ def read_grid(
 
     fine = physical(properties, PROPERTIES) if raw else np.isfinite(properties)
     keep = physical_rows(path, fine, PROPERTIES, told, max_unphysical, warnings)
-    unphysical = int(np.count_nonzero(~keep))
-    if unphysical:
+    if unphysical := int(np.count_nonzero(~keep)):
         voxels, properties, classes = voxels[keep], properties[keep], classes[keep]
     if not raw:
         properties = _to_si(properties, warnings)

@@ -148,8 +148,7 @@ def physical_rows(
     description of the value there and the value in the file.
     """
     keep = np.asarray(fine.all(axis=1))
-    bad = int(np.count_nonzero(~keep))
-    if bad:
+    if bad := int(np.count_nonzero(~keep)):
         row, column = np.argwhere(~fine)[0].tolist()
         what, value = told(row, column)
         if getattr(value, "dtype", None) == np.float16 and np.isinf(value):

@@ -80,10 +80,7 @@ class States:
             return None
         if found.mount not in self._counts:
             listed = _statx(file, _BASIC | _MOUNT)
-            try:
-                mounts = Path("/proc/self/mountinfo").read_text(errors="replace")
-            except OSError:  # Not every sandbox has /proc.
-                mounts = ""
+            mounts = system_text("/proc/self/mountinfo")  # Not every sandbox has /proc.
             self._counts[found.mount] = listed is not None and keeps_times(mounts, listed.mount)
         return found if self._counts[found.mount] else None
 
@@ -106,8 +103,13 @@ def keeps_times(mountinfo: str, mount: int) -> bool:
 @lru_cache(maxsize=1)
 def boot_id() -> str:
     """Return the id of the machine's current boot; numbers of mounts hold only within it."""
+    return system_text("/proc/sys/kernel/random/boot_id").strip()
+
+
+def system_text(path: str) -> str:
+    """Return what a file of the system says; empty if it cannot be read."""
     try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return Path(path).read_text(errors="replace")
     except OSError:
         return ""
 

@@ -26,7 +26,7 @@ from slatprep.storage.versions import store_name
 from slatprep.store import contract
 from slatprep.store.attributes import RootAttributes, read_attributes
 from slatprep.store.contract import NAMES, gate_findings
-from slatprep.store.layout import ARRAYS, ASSET_CHUNK, FILE, MERGED
+from slatprep.store.layout import ARRAYS, ASSET_CHUNK, FILE, MERGED, last_names
 from slatprep.store.shard_reader import BAD_METADATA, DamagedFileError, RowReader
 
 if TYPE_CHECKING:
@@ -35,9 +35,8 @@ if TYPE_CHECKING:
 
 ASSET_COLUMNS = [
     name
-    for layout in ARRAYS
-    for group, _, name in (layout.name.partition("/"),)
-    if group == "asset" and not layout.internal and name not in ("id", "offset", "transform")
+    for name in last_names("asset", (one for one in ARRAYS if not one.internal))
+    if name not in ("id", "offset", "transform")
 ]
 """Last names of the ``asset/*`` arrays that describe an asset."""
 

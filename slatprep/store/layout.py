@@ -8,7 +8,7 @@ finds the assets in a shard.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -177,7 +177,14 @@ FILES = (
 LAYOUTS = {layout.name: layout for layout in (*ARRAYS, *MERGED, RECORDS, *FILES)}
 """Every array that a store may have, by name, except the coordinates of its dimensions."""
 
-MERGED_COLUMNS = tuple(layout.name.removeprefix("voxel/") for layout in MERGED)
+
+def last_names(group: str, arrays: Iterable[ArrayLayout]) -> tuple[str, ...]:
+    """Return the last names of those of the arrays that are in a group."""
+    names = (one.name for one in arrays if one.name.startswith(f"{group}/"))
+    return tuple(name.removeprefix(f"{group}/") for name in names)
+
+
+MERGED_COLUMNS = last_names("voxel", MERGED)
 """Last names of the arrays of `MERGED`."""
 
 
@@ -213,8 +220,7 @@ def rows_per_shard(parameters: StoreParameters, n_voxels: int) -> int:
 
     If parameters give none, it is a power of two of chunks, so that updates seldom change it.
     """
-    chunks = parameters.voxel_chunks_per_shard
-    if not chunks:
+    if not (chunks := parameters.voxel_chunks_per_shard):
         least, most = _CHUNKS_IN_SHARD
         wanted = -(-n_voxels // (MOST_SHARDS * parameters.voxel_chunk))
         chunks = min(max(1 << (wanted - 1).bit_length(), least), most)

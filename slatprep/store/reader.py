@@ -23,7 +23,7 @@ from slatprep.storage.place import Folder, place_of, storage_of
 from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError, number_of, other_store
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_METADATA_BYTES, MAX_VOXELS
-from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with
+from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with, last_names
 from slatprep.store.shard_reader import DamagedFileError
 
 if TYPE_CHECKING:
@@ -32,12 +32,7 @@ if TYPE_CHECKING:
 TRAINING_COLUMNS = ("coords", "feats", "properties")
 """Columns that `Store.read` reads by default."""
 
-VOXEL_COLUMNS = tuple(
-    name
-    for layout in arrays_with(merged=True)
-    for group, _, name in (layout.name.partition("/"),)
-    if group == "voxel"
-)
+VOXEL_COLUMNS = last_names("voxel", arrays_with(merged=True))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -44,8 +44,7 @@ _CHECKED: dict[str, object] = {
 
 
 def _named(versions: dict[str, str]) -> dict[str, str]:
-    missing = {"slatprep", "python", "numpy", "scipy"} - versions.keys()
-    if missing:
+    if missing := {"slatprep", "python", "numpy", "scipy"} - versions.keys():
         raise ValueError(f"no version of {', '.join(sorted(missing))}")
     return versions
 

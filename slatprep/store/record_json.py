@@ -18,7 +18,7 @@ from slatprep.errors import StoreError
 from slatprep.records import SourceFile, oddities_in
 from slatprep.storage.documents import faults_told, read_as
 from slatprep.storage.place import is_place
-from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES
+from slatprep.store.layout import ARRAYS, MAX_RECORD_BYTES, last_names
 from slatprep.store.record import AssetRecord, BuildRecord, Record
 
 FOLDER = Path(__file__).with_name("schema")
@@ -122,5 +122,4 @@ def columns_of(record: AssetRecord) -> dict[str, Any]:
         "latent_mean": np.nan if moments is None else moments.mean,
         "latent_std": np.nan if moments is None else moments.std,
     }
-    names = (layout.name.removeprefix("asset/") for layout in ARRAYS)
-    return {name: entries[name] for name in names if name in entries}
+    return {name: entries[name] for name in last_names("asset", ARRAYS) if name in entries}
