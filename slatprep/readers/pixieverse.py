@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from slatprep import normalize
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import voxels_at
-from slatprep.parameters import PixieverseSource, SampleParameters
+from slatprep.parameters import PixieverseSource
 from slatprep.readers import files
 from slatprep.readers.adapters import Holding, SourceAdapter
 from slatprep.readers.values import FOR_ALL, require_plausible, require_possible, require_prediction
@@ -70,9 +70,7 @@ class PixieVerse(SourceAdapter):
         return read_grid(pair, max_unphysical)
 
 
-def read_grid(
-    pair: AssetPair, max_unphysical: float = SampleParameters.max_unphysical
-) -> MaterialField:
+def read_grid(pair: AssetPair, max_unphysical: float) -> MaterialField:
     """Read the PixieVerse side of a pair: a raw grid or a prediction, and its mask if any.
 
     A raw grid is (64, 64, 64, 4): density [kg/m^3], Young's modulus [Pa], Poisson's ratio, class
