@@ -22,7 +22,7 @@ from calibrate import Table, read_tables
 from numpy.typing import NDArray
 
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT
-from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
+from slatprep.judge.decoys import ErrorRates, error_rates
 from slatprep.judge.verdict import THRESHOLDS
 
 RATE = 0.01
@@ -56,10 +56,12 @@ def _draw(table: Table, share: float, most: int, seed: int) -> dict[str, float]:
         count = len(spare)
     targets = spare[:count] if share == 1 else np.concatenate([right, spare[:count]])
     figures, wrong = table["figures"], table["kind"][targets] == "other"
-    folds = _folds(table)
     good, good_decoys = (_good(figures[rows]) for rows in (targets, decoys))
-    found = error_rates(figures[targets], figures[decoys], folds[targets], folds[decoys],
-                        good=good, good_decoys=good_decoys)  # fmt: skip
+    # Each pair counts as an object of its own.
+    names = [list(map(str, rows)) for rows in (targets, decoys)]
+    found = error_rates(
+        figures[targets], figures[decoys], *names, good=good, good_decoys=good_decoys
+    )
     return _told(found, good, wrong)
 
 
@@ -86,11 +88,6 @@ def _told(found: ErrorRates, good: NDArray[np.bool_], wrong: NDArray[np.bool_]) 
         "kept": (kept & ~wrong).sum() / max((~wrong).sum(), 1),
         "good": (good & ~wrong).sum() / max((~wrong).sum(), 1),
     }
-
-
-def _folds(table: Table) -> NDArray[np.intp]:
-    names = [f"{name} {seed}" for name, seed in zip(table["family"], table["seed"], strict=True)]
-    return np.unique(names, return_inverse=True)[1] % FOLDS
 
 
 def _line(share: float, rows: list[dict[str, float]]) -> str:

@@ -15,6 +15,7 @@ Decoys say nothing about a wrong placement of the right object.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,7 @@ from slatprep.geometry.frames import Array
 from slatprep.judge.calibration import SAME_OBJECT
 from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
+from slatprep.judge.witness import fold_of
 
 Range = tuple[float, float]
 
@@ -100,8 +102,8 @@ class ErrorRates:
 def error_rates(
     targets: Array,
     decoys: Array,
-    target_folds: NDArray[np.intp],
-    decoy_folds: NDArray[np.intp],
+    target_objects: Sequence[str],
+    decoy_objects: Sequence[str],
     *,
     good: NDArray[np.bool_],
     good_decoys: NDArray[np.bool_],
@@ -109,19 +111,22 @@ def error_rates(
 ) -> ErrorRates:
     """Estimate a dataset's errors from the `FIGURES` of its targets (T, F) and decoys (D, F).
 
-    Folds (T,) and (D,) are numbers of `FOLDS` parts; all targets and decoys of an object are in one
-    part. `good` (T,) and `good_decoys` (D,) tell which are called good. Intervals come from random
-    draws with `seed`.
+    Objects (T,) and (D,) name the objects of their grids. Targets of one object may all be wrong
+    together, so intervals and limits count objects. `good` (T,) and `good_decoys` (D,) tell which
+    are called good. Intervals come from random draws with `seed`.
     """
-    refitted = len(targets) >= LEAST_TARGETS and len(decoys) >= LEAST_DECOYS
+    objects, others = len(set(target_objects)), len(set(decoy_objects))
+    refitted = objects >= LEAST_TARGETS and others >= LEAST_DECOYS
     scores, decoy_scores = map(_shipped_scores, (targets, decoys))
     if refitted:
-        scores, decoy_scores = _refitted(targets, decoys, target_folds, decoy_folds)
+        folds = (np.array([fold_of(one, FOLDS) for one in own])
+                 for own in (target_objects, decoy_objects))  # fmt: skip
+        scores, decoy_scores = _refitted(targets, decoys, *folds)
     rng = np.random.default_rng(seed)
-    share, shares = _wrong_share(scores, decoy_scores, rng)
+    share, shares = _wrong_share(scores, decoy_scores, objects, others, rng)
     low, high = _ends(shares)
     count, passed = len(targets), int(good_decoys.sum())
-    passing = rng.beta(passed + 0.5, len(decoys) - passed + 0.5, DRAWS)
+    passing = _drawn(passed / len(decoys), others, rng)
     most = int(good.sum())
     wrong = np.minimum(count * shares * passing, most)
     return ErrorRates(
@@ -144,17 +149,23 @@ def _ends(draws: Array) -> Range:
 
 
 def _wrong_share(
-    scores: Array, decoy_scores: Array, rng: np.random.Generator
+    scores: Array, decoy_scores: Array, objects: int, others: int, rng: np.random.Generator
 ) -> tuple[float, Array]:
-    """Return the estimated share of targets that score like decoys, and draws of that share."""
+    """Return the estimated share of targets that score like decoys, and draws of that share.
+
+    `objects` and `others` are the numbers of the objects of targets and of decoys.
+    """
     limit = np.quantile(decoy_scores, 1.0 - LIKE_DECOYS, method="higher")
-    low, low_decoys = (np.count_nonzero(values <= limit) for values in (scores, decoy_scores))
-    count, decoys = len(scores), len(decoy_scores)
-    # Half a target on each side is added (Jeffreys' prior), as samples are finite. The limit is a
-    # decoy itself, so the share of all decoys below it is distributed as that of its rank.
-    drawn = rng.beta(low + 0.5, count - low + 0.5, DRAWS)
-    drawn /= rng.beta(low_decoys, decoys + 1 - low_decoys, DRAWS)
-    return min(float(low / count / (low_decoys / decoys)), 1.0), np.minimum(drawn, 1.0)
+    low, low_decoys = (float(np.mean(values <= limit)) for values in (scores, decoy_scores))
+    # The limit is a decoy itself, so the share of all decoys below it is distributed as its rank.
+    rank = low_decoys * others
+    shares = _drawn(low, objects, rng) / rng.beta(rank, others + 1 - rank, DRAWS)
+    return min(low / low_decoys, 1.0), np.minimum(shares, 1.0)
+
+
+def _drawn(share: float, count: int, rng: np.random.Generator) -> Array:
+    """Draw what a share of so many may be: half of one is added on each side (Jeffreys' prior)."""
+    return rng.beta(share * count + 0.5, (1.0 - share) * count + 0.5, DRAWS)
 
 
 def _surpassed(scores: Array, by: Array) -> NDArray[np.intp]:

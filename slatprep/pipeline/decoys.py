@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -98,8 +99,7 @@ def measure_errors(
     SlatprepError
         If a decoy kills its worker again when it runs alone.
     """
-    from slatprep.judge.decoys import FOLDS, error_rates
-    from slatprep.judge.witness import fold_of
+    from slatprep.judge.decoys import error_rates
 
     if reason := why_no_decoys(store):
         raise StoreError(f"{store.path}: {reason}")
@@ -120,12 +120,12 @@ def measure_errors(
     for number, decoy in counted(results, len(missing), progress):
         found[number] = decoy
     made = tuple(one for one in found if one.evidence)
-    folds = [fold_of(str(one), FOLDS) for one in store.column("object_id")]
+    objects = _unrelated(store, grids)
     rates = error_rates(
         evidence,
         np.array([one.evidence for one in made], dtype=np.float64),
-        np.array(folds),
-        np.array([folds[store.find(one.grid)] for one in made]),
+        objects,
+        [objects[store.find(one.grid)] for one in made],
         good=store.column("verdict") == str(Verdict.GOOD),
         good_decoys=np.array([one.verdict == Verdict.GOOD for one in made]),
         seed=seed,
@@ -160,7 +160,8 @@ def measure_build(
     """
     measured = measured_errors(store.path) or (measured_errors(before.path) if before else None)
     new = min(allowed_decoys(aligned), most)
-    if new == 0 or len(store) < LEAST_TARGETS or why_no_decoys(store):
+    objects = len(set(map(str, store.column("object_id"))))
+    if new == 0 or objects < LEAST_TARGETS or why_no_decoys(store):
         if measured:
             write_errors(store, measured)
         return
@@ -204,30 +205,59 @@ def draw_decoys(
 ) -> list[Decoy]:
     """Draw grids by a hash of their ids, and for each another object's SLAT of the nearest size.
 
-    The SLAT differs in content from the grid's own. Its asset's grid is another file, by the
-    digests of `grids`, if they are known.
+    No asset of the other object shares a SLAT, or by the digests of `grids` a grid, with one of the
+    grid's object. Each object has one decoy before any has two, and none the same other object
+    twice.
     """
-    ids, objects = store.ids, [str(one) for one in store.column("object_id")]
+    ids, objects = store.ids, _unrelated(store, grids)
     sizes = np.diff(store.offsets).tolist()
     by_hash = sorted(range(len(ids)), key=lambda row: _hash(seed, ids[row]))
     # The sort is stable, so assets of equal size are in the order of their hashes.
     by_size = sorted(by_hash, key=sizes.__getitem__)
     place = {row: at for at, row in enumerate(by_size)}
-    contents: list[Sequence[object]] = [objects, slat_contents(store), grids]
+    paired: defaultdict[str, set[str]] = defaultdict(set)
     drawn = []
-    for row in by_hash[:count]:
-        at = place[row]
+    for row in _in_turn(by_hash, objects)[:count]:
+        at, taken = place[row], paired[objects[row]] | {objects[row]}
         smaller = (by_size[k] for k in range(at - 1, -1, -1))
         larger = (by_size[k] for k in range(at + 1, len(by_size)))
-        alike = [(column, column[row]) for column in contents if column[row]]
         firsts = (
-            next((k for k in side if all(column[k] != own for column, own in alike)), None)
-            for side in (smaller, larger)
+            next((k for k in side if objects[k] not in taken), None) for side in (smaller, larger)
         )
         if near := [k for k in firsts if k is not None]:
             other = min(near, key=lambda k: abs(sizes[k] - sizes[row]))
+            paired[objects[row]].add(objects[other])
             drawn.append(Decoy(ids[row], ids[other], (keys[ids[row]], keys[ids[other]])))
     return drawn
+
+
+def _unrelated(store: Store, grids: Sequence[str]) -> list[str]:
+    """Return the object of each row; objects that share a SLAT or a grid have the same name."""
+    objects, slats = list(map(str, store.column("object_id"))), slat_contents(store)
+    same: dict[str, str] = {}  # the name of each object's relative, itself for the first one
+
+    def first(name: str) -> str:
+        while (other := same.setdefault(name, name)) != name:
+            name = other
+        return name
+
+    for contents in (slats, grids):
+        seen: dict[object, str] = {}
+        for content, name in zip(contents, objects, strict=True):
+            if content:
+                one, other = sorted((first(seen.setdefault(content, name)), first(name)))
+                same[other] = one
+    return list(map(first, objects))
+
+
+def _in_turn(rows: Sequence[int], objects: Sequence[str]) -> list[int]:
+    """Return rows in rounds, each with the next row of every object."""
+    times: Counter[str] = Counter()
+    rounds = []
+    for row in rows:
+        rounds.append(times[objects[row]])
+        times[objects[row]] += 1
+    return [row for _, row in sorted(zip(rounds, rows, strict=True), key=lambda one: one[0])]
 
 
 def _hash(seed: int, text: str) -> bytes:

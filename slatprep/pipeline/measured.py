@@ -132,7 +132,7 @@ class MeasuredErrors:
                 f"likely at most {math.ceil(high):,} of the {self.good:,} called good show another "
                 f"object, and at most {shares[1]:.1%} of all assets",
                 f"measured on {amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')}"
-                f"; an estimate needs at least {LEAST_DECOYS} decoys and {LEAST_TARGETS} assets",
+                f"; an estimate needs {LEAST_TARGETS} objects and decoys of {LEAST_DECOYS}",
             ]
         return [
             f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "

@@ -73,7 +73,8 @@ def dataset_notices(
     # Rows that lie in another store have no column ``grid``.
     yield from shared_sources(new, "grid", [row.columns.get("grid") for row in new.rows])
     if new.normalization.source == "dataset" and any(row.spooled for row in new.rows):
-        yield from wild_ranges(new.ids, new.column("extent"), new.normalization)
+        objects = list(map(str, new.column("object_id")))
+        yield from wild_ranges(new.ids, objects, new.column("extent"), new.normalization)
 
 
 def much_clipped(store: Store) -> Iterator[str]:
@@ -191,13 +192,16 @@ def shared_sources(
 
 
 def wild_ranges(
-    ids: Sequence[str], extents: NDArray[np.float64], normalization: Normalization
+    ids: Sequence[str],
+    objects: Sequence[str],
+    extents: NDArray[np.float64],
+    normalization: Normalization,
 ) -> Iterator[str]:
-    """Yield a notice on each asset that alone makes a range 10 times wider.
+    """Yield a notice on each asset whose object alone makes a range 10 times wider.
 
-    `extents` are (A, P, 2) in mapped units. With two assets, either may be the wrong one.
+    `extents` are (A, P, 2) in mapped units. With two objects, either may be the wrong one.
     """
-    if len(ids) < _NAMED:
+    if len(set(objects)) < _NAMED:
         return
     usual = {one.name: one for one in PIXIE_RANGES.ranges}
     for column, span in enumerate(normalization.ranges):
@@ -206,7 +210,8 @@ def wild_ranges(
             if not np.isfinite(values).all():
                 continue
             last = int(np.argmax(values))
-            own, others = float(values[last]), np.delete(extents[:, column], last, axis=0)
+            elsewhere = [one != objects[last] for one in objects]
+            own, others = float(values[last]), extents[elsewhere, column]
             beside = float((sign * others[:, end]).max())
             width = max(float(others[:, 1].max() - others[:, 0].min()), 1e-12)
             if own - beside < (_WILD_DECADES if span.log10 else _WILD_WIDTHS * width):

@@ -107,7 +107,9 @@ def resolved_contents(
     """Return the contents of a store, with the latent space that `resolve_latents` finds."""
     # Sums of the same numbers in another order differ in their last digits.
     rows = sorted(rows, key=lambda row: row.asset_id)
-    moments = list(zip((row.n_voxels for row in rows), moments_of(rows, stores), strict=True))
+    # Annotations of one object share its SLAT, which counts once.
+    counts = (row.n_voxels for row in rows)
+    moments = list(dict.fromkeys(zip(counts, moments_of(rows, stores), strict=True)))
     return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
 
 

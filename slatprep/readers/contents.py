@@ -123,7 +123,7 @@ def resolve_latents(
 ) -> LatentSpace:
     """Return the space of a dataset's latents after all assets have been read.
 
-    `moments` holds the voxel count and moments of each asset, in the order of their ids. If
+    `moments` holds the voxel count and moments of each SLAT, in the order of the assets' ids. If
     `standardised` is ``auto``, they decide whether latents are standardised.
     """
     known = [(count, one) for count, one in moments if one is not None and count]

@@ -16,7 +16,7 @@ from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, evidence, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import causes_of_doubt
-from slatprep.judge.decoys import FOLDS, ErrorRates, error_rates
+from slatprep.judge.decoys import ErrorRates, error_rates
 from slatprep.judge.model import FLOOR
 from slatprep.judge.verdict import LEAST_TARGETS
 from slatprep.normalize import (
@@ -72,9 +72,15 @@ def wrong(count: int, seed: int = 1) -> np.ndarray:
     return made(count, (0.2, 1.0), seed)
 
 
+def apart(figures: np.ndarray) -> list[str]:
+    """Return names of objects with one row each."""
+    return list(map(str, range(len(figures))))
+
+
 def rated(targets: np.ndarray, decoys: np.ndarray) -> ErrorRates:
-    folds = (np.arange(len(targets)) % FOLDS, np.arange(len(decoys)) % FOLDS)
-    found = error_rates(targets, decoys, *folds, **called_good(targets, decoys))
+    found = error_rates(
+        targets, decoys, apart(targets), apart(decoys), **called_good(targets, decoys)
+    )
     # Errors never rise with the score.
     order = np.argsort(found.scores)
     assert (np.diff(found.errors[order]) <= 1e-12).all()
@@ -134,6 +140,23 @@ def test_the_interval_of_few_decoys_holds_the_true_share(few):
     assert np.mean([found.wrong_share_range[1] < 0.3 for found in draws]) < 0.05
 
 
+def test_the_interval_holds_the_true_share_where_whole_objects_are_wrong():
+    """Of 28 objects of eight rows each a fifth is wrong, all rows of it together."""
+    rng, names = np.random.default_rng(4), [str(k) for k in range(28) for _ in range(8)]
+    held = []
+    for seed in range(60):
+        bad = np.repeat(rng.random(28) < 0.2, 8)
+        targets = right(224, seed)
+        targets[bad] = wrong(224, seed + 1000)[bad]
+        decoys = wrong(112, seed + 2000)
+        found = error_rates(
+            targets, decoys, names, names[::2], **called_good(targets, decoys), seed=seed
+        )
+        assert not found.refitted
+        held.append(found.wrong_share_range[0] <= 0.2 <= found.wrong_share_range[1])
+    assert np.mean(held) > 0.9
+
+
 def test_of_shuffled_pairs_hardly_any_is_kept():
     found = rated(wrong(300, 7), wrong(200))
     assert found.wrong_share > 0.9
@@ -162,13 +185,11 @@ def test_few_assets_are_judged_by_the_shipped_model(count):
 
 def test_the_order_of_assets_does_not_matter():
     targets, decoys = np.concatenate([wrong(40, 3), right(160)]), wrong(100)
-    folds = np.arange(len(targets)) % FOLDS
-    rest = (np.arange(100) % FOLDS,)
-    good = called_good(targets, decoys)
-    first = error_rates(targets, decoys, folds, *rest, **good)
+    names, good = np.array(apart(targets)), called_good(targets, decoys)
+    first = error_rates(targets, decoys, names, apart(decoys), **good)
     order = np.random.default_rng(0).permutation(len(targets))
     second = error_rates(
-        targets[order], decoys, folds[order], *rest, **good | {"good": good["good"][order]}
+        targets[order], decoys, names[order], apart(decoys), **good | {"good": good["good"][order]}
     )
     np.testing.assert_allclose(second.errors, first.errors[order], atol=1e-6)
     assert second.wrong_share == pytest.approx(first.wrong_share)

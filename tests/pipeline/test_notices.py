@@ -20,9 +20,9 @@ from slatprep.store.record import FailedRecord
 USUAL = ((3.2, 10.8), (1.8, 3.8), (0.21, 0.45))
 
 
-def told(*rows: tuple[tuple[float, float], ...]) -> list[str]:
-    extents = np.array(rows, dtype=float)
-    return list(wild_ranges("abcdefgh"[: len(rows)], extents, ranges_from_extents(extents)))
+def told(*rows: tuple[tuple[float, float], ...], objects: str = "abcdefgh") -> list[str]:
+    extents, ids = np.array(rows, dtype=float), "abcdefgh"[: len(rows)]
+    return list(wild_ranges(ids, objects[: len(rows)], extents, ranges_from_extents(extents)))
 
 
 def test_an_asset_that_alone_widens_a_range_is_named():
@@ -30,6 +30,13 @@ def test_an_asset_that_alone_widens_a_range_is_named():
     assert text.startswith("b alone makes the range of density 7.94e+05 times wider")
     (text,) = told(USUAL, USUAL, ((-3.7, 10.8), *USUAL[1:]))
     assert text.startswith("c alone makes the range of youngs_modulus")
+
+
+def test_views_of_one_object_that_widen_a_range_together_are_named():
+    wild = (USUAL[0], (1.8, 9.7), USUAL[2])
+    (text,) = told(USUAL, wild, wild, USUAL, objects="abbc")
+    assert text.startswith("b alone makes the range of density 7.94e+05 times wider")
+    assert told(USUAL, wild, wild, USUAL, objects="abba") == []
 
 
 def test_ranges_that_pixie_publishes_are_no_surprise():
