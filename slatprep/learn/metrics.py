@@ -117,6 +117,20 @@ Measures = dict[str, Measure]
 """Scores by the name of a method."""
 
 
+def means_of_objects(
+    objects: NDArray[np.str_], rows: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Average the rows (A, ...) of assets over the assets of each object: (O, ...).
+
+    Return the first asset of each object, too. Where an object has NaN alone, the mean is NaN.
+    """
+    _, first, number = np.unique(objects, return_index=True, return_inverse=True)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Mean of empty slice")  # No view has a class.
+        means = [np.nanmean(rows[number == k], axis=0) for k in range(len(first))]
+    return first, np.array(means)
+
+
 def average_methods(
     store: Store,
     scored: Mapping[int, Sequence[NDArray[np.float64]]],
@@ -132,11 +146,7 @@ def average_methods(
         np.array([str(column[index]) for index in scored])
         for column in (store.column("object_id"), store.column("category"))
     )
-    _, first, number = np.unique(objects, return_index=True, return_inverse=True)
-    rows = np.array(list(scored.values()))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Mean of empty slice")  # No view has a class.
-        per_object = np.array([np.nanmean(rows[number == k], axis=0) for k in range(len(first))])
+    first, per_object = means_of_objects(objects, np.array(list(scored.values())))
     category, names = categories[first], metrics_of(store.normalization)
 
     def measures(chosen: NDArray[np.bool_]) -> Measures:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,7 +20,7 @@ from slatprep.errors import ConfigError, require_one_of
 from slatprep.learn.augment import Augmentation
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch
 from slatprep.learn.decoder import SIZES, Prediction, make_decoder
-from slatprep.learn.metrics import COLUMNS, fit_baselines, score_asset
+from slatprep.learn.metrics import COLUMNS, fit_baselines, means_of_objects, score_asset
 from slatprep.learn.predict import (
     Checkpoint,
     checkpoint_state,
@@ -211,12 +212,19 @@ def train(
                 for index in val_set.indices.tolist():
                     rows = opened.read(index, COLUMNS)
                     errors.append(score_asset(one.predict(rows), rows)[-2])
-                references[one.name] = float(np.mean(errors))
+                references[one.name] = float(_over_objects(val_set, errors))
             run.draw(session.history, references)
         predictions = run.path / PREDICTIONS
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     diverged_in = session.epoch - 1 if session.diverged() else None
     return TrainSummary(session.history, session.best_epoch, references, predictions, diverged_in)
+
+
+def _over_objects(dataset: SlatDataset, scores: Sequence[Any]) -> NDArray[np.float64]:
+    """Return the mean over objects of scores of a dataset's assets, as `slatprep evaluate` does."""
+    objects = dataset.store.column("object_id")[dataset.indices].astype(str)
+    _, means = means_of_objects(objects, np.array(scores))
+    return np.asarray(means.mean(axis=0))
 
 
 def precision_of(device: str) -> str:
@@ -343,7 +351,7 @@ class _Session:
 
     @torch.no_grad()
     def validate(self) -> tuple[float, float, float]:
-        """Return loss, MSE and class accuracy, means over assets; NaN where not defined."""
+        """Return loss, MSE and class accuracy, means over objects; NaN where not defined."""
         if self.val_set is None:
             return math.nan, math.nan, math.nan
         self.model.eval()
@@ -355,7 +363,7 @@ class _Session:
             error = (prediction.properties - moved.properties)[valid].square().mean()
             right = (prediction.logits.argmax(1) == moved.material)[valid].float().mean()
             scores.append([float(loss_of(prediction, moved)), float(error), float(right)])
-        loss, error, accuracy = np.mean(scores, axis=0).tolist()
+        loss, error, accuracy = _over_objects(self.val_set, scores).tolist()
         return loss, error, accuracy if self.val_set.store.contents.classes else math.nan
 
     def state(self) -> dict[str, Any]:

@@ -37,6 +37,21 @@ BY_FILE = {"train": ["a", "b", "c"], "val": ["d"], "test": ["e", "h.front"]}
 FAST = (*SMALL, "--learning-rate", "0.002")
 
 
+def test_validation_counts_objects_as_evaluate_does(learn_store, tmp_path):
+    """Of the two validation objects one has two views."""
+    lists, out = tmp_path / "lists.json", tmp_path / "run"
+    lists.write_text(json.dumps({"train": [*"abcdf"], "val": ["g", "h"], "test": ["e"]}))
+    given = dataclasses.replace(SHORT, split_by=str(lists), epochs=1, keep="best")
+    summary = train(learn_store, out, given)
+    chosen = ("--checkpoint", out, "--asset", "g", "--asset", "h.front", "--asset", "h.side")
+    run("predict", learn_store, *chosen, "--out", tmp_path / "said")
+    rule = ("--split", "val", "--split-by", lists, "--json")
+    found = json.loads(run("evaluate", tmp_path / "said", "--store", learn_store, *rule).stdout)
+    means = found["methods"]["these predictions"]["means"]
+    assert summary.history[0].val_accuracy == pytest.approx(means["accuracy"], abs=1e-6)
+    assert summary.history[0].val_mse == pytest.approx(means["mean"], abs=1e-6)
+
+
 def test_loss_by_hand():
     batch = SparseBatch(
         ["a"],
