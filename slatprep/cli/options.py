@@ -457,7 +457,25 @@ def split_of_objects(
             output.note(
                 f"note:    {amount(len(ids), 'id')} {what}: {', '.join(ids[:3])[:200]}{more}"
             )
+    if torn := _copies_apart(store, assignment.splits):
+        output.note(
+            f"note:    {amount(len(torn), 'SLAT')} with copies in other splits, under other ids "
+            f"({' = '.join(torn[0])}); --split-by FILE can keep copies together"
+        )
     return assignment.splits
+
+
+def _copies_apart(store: Store, splits: Mapping[str, Split]) -> list[list[str]]:
+    """Return an object of each split for each SLAT that lies in several."""
+    from slatprep.pipeline.rows import slat_contents
+
+    found: dict[bytes, dict[Split, str]] = {}
+    for content, name in zip(
+        slat_contents(store), map(str, store.column("object_id")), strict=True
+    ):
+        if content and name in splits:
+            found.setdefault(content, {}).setdefault(splits[name], name)
+    return [list(own.values()) for own in found.values() if len(own) > 1]
 
 
 def _shares(text: str) -> Shares:

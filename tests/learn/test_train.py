@@ -383,6 +383,20 @@ def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_
     assert "left out: 1 above the ambiguity 0.125, 1 failed (as " in measured.stderr
 
 
+def test_copies_of_a_slat_in_two_splits_are_named(tmp_path):
+    dataset, store = Dataset(tmp_path / "sources").having(*"abcd"), tmp_path / "s.zarr"
+    shutil.copy(tmp_path / "sources" / "slat" / "a.npz", tmp_path / "sources" / "slat" / "d.npz")
+    build_store(dataset.parameters(), store)
+    lists = tmp_path / "lists.json"
+    lists.write_text(json.dumps({"train": ["a", "b"], "val": ["c"], "test": ["d"]}))
+    command = ("train", store, "--out", tmp_path / "run", *FAST, "--epochs", "1")
+    told = run(*command, "--split-by", lists).stderr
+    assert "1 SLAT with copies in other splits, under other ids (a = d)" in told
+    lists.write_text(json.dumps({"train": ["a", "d"], "val": ["c"], "test": ["b"]}))
+    again = run(*command[:3], tmp_path / "again", *command[4:], "--split-by", lists).stderr
+    assert "with copies" not in again
+
+
 def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, tmp_path):
     lists, out = tmp_path / "lists.json", tmp_path / "run"
     lists.write_text(json.dumps(BY_FILE | {"train": ["a", "b", "c", "nobody"]}))
