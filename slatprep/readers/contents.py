@@ -133,7 +133,7 @@ def resolve_latents(
     auto = standardised == "auto" and sum(count for count, _ in known) >= ENOUGH
     if auto and len(known) == 1 and not tell_alone(pooled, declared):
         raise ConfigError(
-            "one asset alone does not tell whether its latents have been standardised "
+            "one SLAT alone does not tell whether its latents have been standardised "
             f'({in_words(pooled)}). Say standardised = "yes" or "no" in [slat] of a --config FILE'
         )
     if auto:

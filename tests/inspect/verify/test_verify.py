@@ -403,7 +403,7 @@ def test_ties_that_change_properties_within_a_class_verify_as_they_were_built(ma
         grid[12:52, 24:40, 28:36] = 2700.0, 7e10, 0.3, 1
         grid[32:52, 24:40, 28:36, 1] = second
         dataset.write_grid(name, grid)
-        dataset.write_slat(f"{name}.npz", latents.coords, latents.feats)
+        dataset.write_slat(f"{name}.npz", latents.coords, latents.feats + (name == "metals"))
     path = dataset.root / "store.zarr"
     build_store(dataset.parameters(), path)
     opened = open_store(path)
