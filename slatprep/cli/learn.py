@@ -223,7 +223,7 @@ def _show_training(output: Output, summaries: dict[str, TrainSummary]) -> None:
     # Without classes there is no accuracy.
     classified = not all(math.isnan(epoch.val_accuracy) for epoch in best.values())
     columns = ("model", "epoch", "mse", "accuracy")[: 4 if classified else 3]
-    title = "Validation (mean squared error in normalised space, mean over assets)"
+    title = "Validation (mean squared error in normalised space, mean over objects)"
     output.table(title, columns, [row[: len(columns)] for row in rows])
 
 

@@ -16,8 +16,9 @@ decoder.SIZES["tiny"] = decoder.DecoderSize(24, 2, 2)
 
 
 @pytest.fixture(autouse=True)
-def _as_it_was() -> None:
-    """Compute on one thread and by any algorithm, whatever a command has set."""
+def _as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute on one thread and by any algorithm, whatever a command has set, and on no GPU."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     torch.use_deterministic_algorithms(False)
     torch.set_num_threads(1)
 
