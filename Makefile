@@ -73,9 +73,8 @@ endif
 	exit $$status
 
 $(DEMO)/.assets-$(ASSETS)-seed-$(SEED): | $(INSTALLED)
-	@new=$(DEMO)-$$$$; \
-	$(BIN)/slatprep make-demo $$new --assets $(ASSETS) --seed $(SEED) --quiet || \
-	    { status=$$?; rm -rf $$new; exit $$status; }; \
+	@new=$(DEMO)-$$$$; trap 'rm -rf '"$$new" EXIT INT TERM; \
+	$(BIN)/slatprep make-demo $$new --assets $(ASSETS) --seed $(SEED) --quiet && \
 	rm -rf $(DEMO) && mv $$new $(DEMO) && touch $@
 
 # -- development ------------------------------------------------------------

@@ -5,6 +5,8 @@ import hashlib
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -145,8 +147,20 @@ def test_names(tmp_path):
         work.list_extractions([tmp_path / ".hidden.png"], tmp_path, [1], False)
 
 
-def test_a_run_that_stopped_before_its_latents_were_there_goes_on(session, images, tmp_path):
+def test_a_run_that_stopped_before_its_latents_were_there_goes_on(
+    session, images, tmp_path, monkeypatch
+):
+    put, staged = [], work.staged
+
+    @contextmanager
+    def noted(path: Path) -> Iterator[Path]:
+        with staged(path) as made:
+            yield made
+        put.append(path.name)
+
+    monkeypatch.setattr(work, "staged", noted)
     run(session, images[:1], tmp_path / "slat", 3)
+    assert put == ["cup.json", "cup.npz"]
     (tmp_path / "slat" / "cup.npz").unlink()  # The record is written first.
     [result] = run(session, images[:1], tmp_path / "slat", 3)
     assert not result.kept and (tmp_path / "slat" / "cup.npz").is_file()

@@ -70,7 +70,11 @@ def find_consensus(transforms: ArrayLike, objects: Sequence[str]) -> Consensus |
     if agreeing < LEAST_WINNERS or agreeing < LEAST_SHARE * len(votes):
         return None
     others = tuple(np.where(np.arange(_QUARTERS) == common, 0, counts).tolist())
-    return Consensus(_mean_rotation(rotations[nearest == common]), len(votes), agreeing, others)
+    members: dict[str, list[NDArray[np.float64]]] = {}
+    for k in np.flatnonzero(nearest == common).tolist():
+        members.setdefault(str(objects[k]), []).append(rotations[k])
+    means = [_mean_rotation(own) if own[1:] else own[0] for own in members.values()]
+    return Consensus(_mean_rotation(means), len(votes), agreeing, others)
 
 
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
@@ -173,7 +177,7 @@ def degrees_between(rotation: ArrayLike, other: ArrayLike) -> Any:
     return np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
-def _mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean_rotation(rotations: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the chordal mean: the rotation nearest to the mean matrix."""
     # Summed in sorted order: the mean must not depend on the order of assets.
     ordered = sorted(rotations, key=lambda rotation: rotation.tobytes())

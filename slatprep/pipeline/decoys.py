@@ -216,9 +216,11 @@ def draw_decoys(
     by_size = sorted(by_hash, key=sizes.__getitem__)
     place = {row: at for at, row in enumerate(by_size)}
     paired: defaultdict[str, set[str]] = defaultdict(set)
-    drawn = []
+    drawn, every = [], len(set(objects))
     for row in _in_turn(by_hash, objects)[:count]:
         at, taken = place[row], paired[objects[row]] | {objects[row]}
+        if len(taken) == every:
+            continue  # It has met all others, so the search below would be of all rows.
         smaller = (by_size[k] for k in range(at - 1, -1, -1))
         larger = (by_size[k] for k in range(at + 1, len(by_size)))
         firsts = (
@@ -238,7 +240,7 @@ def _unrelated(store: Store, grids: Sequence[str]) -> list[str]:
 
     def first(name: str) -> str:
         while (other := same.setdefault(name, name)) != name:
-            name = other
+            same[name] = name = same[other]
         return name
 
     for contents in (slats, grids):

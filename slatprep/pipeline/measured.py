@@ -195,8 +195,8 @@ def told_of(store: Store) -> list[str]:
     if (measured := errors_of(store)) is None:
         if reason := why_no_decoys(store):
             return [f"not measured: {reason}"]
-        few = len(store) < LEAST_TARGETS
-        too = f", and so does a build of {LEAST_TARGETS} assets or more" if few else ""
+        few = len(set(map(str, store.column("object_id")))) < LEAST_TARGETS
+        too = f", and so does a build of {LEAST_TARGETS} objects or more" if few else ""
         return [f"not measured; `slatprep measure-errors` does it{too}"]
     told = measured.sentences()
     if measured.build != store.about.manifest:

@@ -7,16 +7,18 @@ with the expected ones, and its size with the bytes that are there.
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import io
 import math
 import re
+import struct
 import sys
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -90,7 +92,7 @@ class ArraySpec:
 
     In a shape, None stands for 0 to `max_rows` rows, and a range for any size in it. Without
     `shapes`, any shape of 1 to `max_items` values is allowed. An error adds `note` to the allowed
-    shapes. A file may state the `units` of the values, any of these; none of them allows any.
+    shapes. A file may state the `unit` of the values; an empty one allows any.
     """
 
     shapes: tuple[tuple[int | range | None, ...], ...]
@@ -98,7 +100,7 @@ class ArraySpec:
     max_items: int = 64
     note: str = ""
     max_rows: int = RESOLUTION**3
-    units: tuple[str, ...] = ()
+    unit: str = ""
 
     def check(self, where: str | Place, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         """Raise InputError, naming `where`, unless shape and dtype are allowed."""
@@ -125,15 +127,16 @@ class ArraySpec:
                 fault = f"its values are packed, by {name} {attributes[name]}"
                 raise InputError(where, fault, "the values themselves, and no such attribute")
         for name in ("_FillValue", "missing_value"):
-            fill = np.asarray(attributes.get(name, np.nan))
-            if fill.dtype.kind in "fiu" and np.isin(values, fill).any():
+            fill = attributes.get(name, np.nan)
+            with suppress(TypeError, ValueError, struct.error):  # xarray packs floats in JSON.
+                (fill,) = struct.unpack("<d", base64.b64decode(fill, validate=True))
+            if np.asarray(fill).dtype.kind in "fiu" and np.isin(values, fill).any():
                 fault = f"{name} {fill} marks values as missing"
                 raise InputError(where, fault, "rows of voxels that have all values")
-        said = attributes.get("units", "")
-        said = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
-        if self.units and _factors(said) not in [{}, *map(_factors, self.units)]:
+        said = str(np.atleast_1d(np.asarray(attributes.get("units", "")).astype(str))[0])
+        if self.unit and _factors(said) not in ({}, _factors(self.unit)):
             fault = f"its attribute units says {said!r}"
-            raise InputError(where, fault, f"values in {self.units[0]}, and no other unit")
+            raise InputError(where, fault, f"values in {self.unit}, and no other unit")
 
     def _fits(self, shape: tuple[int, ...], allowed: tuple[int | range | None, ...]) -> bool:
         return len(shape) == len(allowed) and all(
@@ -145,7 +148,10 @@ class ArraySpec:
 def _factors(unit: str) -> dict[str, int]:
     """Return the exponent of each part of a unit, however it is written: ``kg/m^3``, ``kg m-3``."""
     plain = unit.translate(str.maketrans("²³⁻", "23-"))
-    parts = re.findall(r"(/?)\s*([^\W\d_]+)\s*(?:\^|\*\*)?\s*(-?\d*)", plain)
+    form = r"(/?)\s*([^\W\d_]+)\s*(?:\^|\*\*)?\s*((?:-?\d+)?)"
+    parts = re.findall(form, plain)
+    if re.sub(form, "", plain).strip(" .·*()[]'") not in ("", "1"):
+        return {unit: 1}  # It has a factor, or what is no unit.
     return {
         name: int(power or 1) * (-1 if over else 1)
         for over, name, power in parts

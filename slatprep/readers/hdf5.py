@@ -168,7 +168,7 @@ def _read_dataset(dataset: h5py.Dataset, where: str, spec: ArraySpec) -> NDArray
     if dataset.shape is None:
         raise InputError(where, "has no values", expected)
     if dataset.dtype.hasobject:
-        raise InputError(where, "is text", "numbers")
+        raise InputError(where, "is text, or has rows of several lengths", "numbers")
     spec.check(where, dataset.shape, dataset.dtype)
     if h5py.check_enum_dtype(dataset.dtype) is not None:
         raise InputError(where, "is an enumeration, with names of its own", "plain integers")

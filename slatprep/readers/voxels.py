@@ -114,7 +114,8 @@ class PlainVoxels(SourceAdapter):
         """Find the fields by the names of their files."""
         # Unlike a grid and a prediction, two forms of an object are equal, and none precedes.
         patterns, chosen = patterns_of(self, source), chosen_sample(source)
-        for found in find_by_pattern(patterns, listing, chosen, first=False):
+        stated = patterns is not self.patterns  # A person's own patterns are in their order.
+        for found in find_by_pattern(patterns, listing, chosen, first=stated):
             yield replace(found, path=found.path.removesuffix(_GROUP), beside=(DESCRIPTION,))
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
@@ -125,8 +126,7 @@ class PlainVoxels(SourceAdapter):
         said = _parsed(text, str(root / DESCRIPTION))
         specs = {"voxels": _VOXELS}
         for one in said.properties:
-            stated = filter(None, (one.unit, pair.roots.units.of(one.name)))
-            specs[one.name] = replace(_COLUMN, units=tuple(stated))
+            specs[one.name] = replace(_COLUMN, unit=pair.roots.units.of(one.name) or one.unit)
         specs |= {"material": _COLUMN} if said.classes else {}
         data, file = files.load_source(path, root, "grid")
         kind = path.suffix.lower()

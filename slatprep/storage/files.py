@@ -22,9 +22,9 @@ from urllib.parse import quote
 if TYPE_CHECKING:
     from slatprep.records import Place
 
-_NO_WAITING = os.O_NONBLOCK  # a pipe's reader would wait for a writer
+_NO_WAITING = getattr(os, "O_NONBLOCK", 0)  # a pipe's reader would wait for a writer
 
-OWN_FILE = os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | _NO_WAITING
+OWN_FILE = os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0) | _NO_WAITING
 """Flags to open or create our own file without following links or waiting for pipes."""
 
 

@@ -81,6 +81,11 @@ def test_assets_of_one_object_count_once_for_each_way_they_are_turned():
     assert (found.winners, found.agreeing, sorted(found.others)[-2:]) == (7, 5, [0, 2])
     assert find_consensus(turns[1:], ["duck", *objects[2:]]).agreeing == 5
     assert find_consensus(turns[:39], objects[:39]) is None
+    # However many rows one object has, it has the same part in the mean.
+    tilt = Rotation.from_euler("x", 12, degrees=True).as_matrix()
+    tilted = [make_transform(tilt @ COMMON)] * 36 + turns[36:40]
+    mean = find_consensus(tilted, objects[:40]).rotation
+    assert degrees_between(mean, COMMON) == pytest.approx(12 / 5, abs=0.05)
 
 
 def test_no_turn_and_half_a_turn_are_angles_too():

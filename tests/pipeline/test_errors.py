@@ -76,6 +76,23 @@ def test_pairs_that_share_a_slat_or_a_grid_are_no_decoys(make_dataset, tmp_path)
     assert "decoys need two objects that share neither grid nor SLAT" in said
 
 
+def test_each_object_has_a_decoy_before_any_has_two_and_meets_no_other_twice(
+    make_dataset, tmp_path
+):
+    dataset, out = make_dataset("a", "b", "c"), tmp_path / "s.zarr"
+    dataset.add("d", 3, views=("front", "side", "top", "back", "left"))
+    build_store(dataset.parameters(), out)
+    store = open_store(out)
+    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    _, grids, _ = decoys._evidence_of(store)
+    for seed in range(6):
+        drawn = draw_decoys(store, dict.fromkeys(store.ids, ""), grids, 99, seed)
+        assert sorted(objects[one.grid] for one in drawn[:4]) == ["a", "b", "c", "d"]
+        met = [(objects[one.grid], objects[one.slat]) for one in drawn]
+        assert len(set(met)) == len(met) == 3 + 3
+        assert {other for own, other in met if own == "d"} == {"a", "b", "c"}
+
+
 def test_a_disk_that_cannot_be_written_is_told_before_decoys_are_aligned(store, monkeypatch):
     monkeypatch.setattr(decoys, "align_decoy", None)
     monkeypatch.setattr("os.access", lambda path, mode: mode != os.W_OK)  # As on a read-only disk.
@@ -139,7 +156,7 @@ def test_commands_tell_what_was_measured_and_where_that_is_of_before(store, tmp_
     file.write_text("{")
     assert measured_errors(store.path) is None
     assert told_of(store) == [
-        "not measured; `slatprep measure-errors` does it, and so does a build of 50 assets or more"
+        "not measured; `slatprep measure-errors` does it, and so does a build of 50 objects or more"
     ]
 
 

@@ -173,6 +173,21 @@ def test_measured_moments_do_not_depend_on_the_order_of_rows(tmp_path):
         assert tree(tmp_path / f"{name}.zarr") == tree(tmp_path / f"{whole}.zarr")
 
 
+def test_a_slat_that_several_assets_have_counts_once_in_the_moments(tmp_path):
+    """One annotation more, or a copy under another id, tells nothing more of the encoder."""
+    description = tmp_path / "mine.json"
+    description.write_text(json.dumps({"encoder": "mine", "channels": 8, "resolution": 64}))
+    found = []
+    for name in ("abc", "abcd"):
+        dataset = Dataset(tmp_path / name).having(*"abc")
+        if name == "abcd":
+            dataset.add("d", 2)
+        out = tmp_path / f"{name}.zarr"
+        build_store(dataset.parameters("pixie", slat={"encoder": str(description)}), out)
+        found.append(open_store(out).contents.latents)
+    assert found[0].mean == found[1].mean and found[0].std == found[1].std
+
+
 def test_attributes_that_do_not_fit_the_arrays_are_refused(copy):
     edit_attributes(copy, latents={"encoder": "x", "channels": 9, "resolution": 64})
     with pytest.raises(StoreError, match="9 columns of voxel/feats"):

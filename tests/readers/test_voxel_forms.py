@@ -294,6 +294,13 @@ def test_zarr_that_cannot_be_read_is_said(root, how):
     ("missing_value", 2500, "missing_value 2500 marks values as missing"),
     ("units", "g/cm^3", "its attribute units says 'g/cm^3'; expected values in kg/m^3"),
     ("units", "kg m-2", "its attribute units says 'kg m-2'"),
+    ("units", "10^3 kg/m^3", "its attribute units says '10^3 kg/m^3'"),
+    ("units", "1000 kg/m3", "its attribute units says '1000 kg/m3'"),
+    ("units", "%", "its attribute units says '%'"),
+    ("_FillValue", "AAAAAACIo0A=", "_FillValue 2500.0 marks values as missing"),
+    ("_FillValue", "no base64", ""),
+    ("units", "kg-m", "its attribute units says 'kg-m'"),
+    ("units", np.array([b"kg/m^3"]), ""),
     ("units", "kg m-3", ""),
     ("units", "kg·m⁻³", ""),
     ("units", "kg / m**3", ""),
@@ -310,7 +317,8 @@ def test_attributes_that_give_values_another_meaning_are_heeded(root, form, attr
         with h5py.File(root / "a.h5", "a") as file:
             file["density"].attrs[attribute] = value
     else:
-        zarr.open_array(root / "a.zarr" / "density").attrs[attribute] = value
+        given = value.astype(str).tolist() if isinstance(value, np.ndarray) else value
+        zarr.open_array(root / "a.zarr" / "density").attrs[attribute] = given
     if said:
         refused(root, rf"\[density\]: {re.escape(said)}")
     else:
@@ -319,7 +327,7 @@ def test_attributes_that_give_values_another_meaning_are_heeded(root, form, attr
 
 @pytest.mark.parametrize(("column", "said"), [
     (lambda column: column.astype(h5py.enum_dtype({"steel": 0, "wood": 1})), "is an enumeration"),
-    (lambda column: column.astype("O").astype(str).astype(object), "is text; expected numbers"),
+    (lambda column: column.astype("O").astype(str).astype(object), "is text, or has rows of"),
 ])  # fmt: skip
 def test_classes_by_names_in_hdf5_are_refused(root, column, said):
     rows = rows_of(100)
@@ -351,6 +359,17 @@ def test_two_forms_of_one_object_are_refused(root):
     source = PixieverseSource(root=root, adapter="voxels")
     assert {one.path for one in find_grids(source)["a"]} == {"a.npz", "a.h5"}
     refused(root, r"2 grids for one id 'a' \(a\.h5, a\.npz\)")
+    # Patterns that a person states are in the order of preference.
+    stated = PixieverseSource(root=root, adapter="voxels", grid=("{id}.npz", "{id}.*"))
+    assert [one.path for one in find_grids(stated)["a"]] == ["a.npz"]
+
+
+def test_a_unit_of_the_dataset_definition_goes_before_that_of_the_description(root):
+    sources.write_voxels(root, "a", "hdf5", rows_of(100))
+    with h5py.File(root / "a.h5", "a") as file:
+        file["density"].attrs["units"] = "kg/m^3"
+    assert len(field_at(root).voxels) == 100
+    refused(root, "says 'kg/m\\^3'; expected values in g/cm\\^3", density="g/cm^3")
 
 
 @pytest.mark.parametrize("name", ["voxels", "material", "density", "damping"])
