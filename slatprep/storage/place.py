@@ -47,9 +47,10 @@ if TYPE_CHECKING:
     from slatprep.records import Place
 
 # pathlib makes one slash of two, and one letter is a drive.
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL | re.IGNORECASE)
 
-_LOCAL = ("file", "local")
+_LOCAL, _SAME = ("file", "local"), {"s3a": "s3", "gcs": "gs"}
+"""Protocols of the local disk, and other names of protocols."""
 
 RangeFile = LocalFile | RemoteFile
 """A file for reading ranges; threads may share it."""
@@ -62,7 +63,8 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     """Return a path of the local disk, or a `RemotePlace` for the URL of an object store.
 
     A relative path starts from `folder`, if given. Links in it are then resolved, and ``~`` stands
-    for the user's folder. TypeError if it is neither a text nor a path.
+    for the user's folder. TypeError if it is neither a text nor a path, ConfigError for a URL
+    without a bucket, or one that object stores take differently.
 
     >>> print(place_of("s3://bucket/demo.zarr") / "zarr.json")
     s3://bucket/demo.zarr/zarr.json
@@ -72,10 +74,18 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     if not (isinstance(text, str | os.PathLike) or is_place(text)):
         raise TypeError(f"{text!r} is no place; expected a path or a URL")
     url = _URL.fullmatch(str(text))
-    if url and url[1] not in _LOCAL:
-        if ".." in url[2].split("/") or not url[2].isprintable():
-            raise ConfigError(f"{url[0]!r} has '..' or a control character; expected a plain URL")
-        return RemotePlace(url[1], PurePosixPath(url[2]))
+    protocol = url[1].lower() if url else ""
+    if url and protocol not in _LOCAL:
+        if not url[2].strip("/"):
+            raise ConfigError(
+                f"{url[0]!r} names no bucket; expected a URL such as s3://bucket/name"
+            )
+        if ".." in url[2].split("/") or "::" in url[2] or not url[2].isprintable():
+            fault = "has '..', '::' or a control character"
+            raise ConfigError(f"{url[0]!r} {fault}; expected a plain URL")
+        return RemotePlace(_SAME.get(protocol, protocol), PurePosixPath(url[2]))
+    if not url and "://" in str(text):
+        raise ConfigError(f"{str(text)!r} is no URL; expected one such as s3://bucket/name")
     path = Path("/", url[2]) if url else Path(str(text))
     return path if folder is None else (folder / path.expanduser()).resolve()
 

@@ -76,6 +76,8 @@ def published_state(target: RemotePlace) -> PublishedState:
     """
     if versions.is_version(target):
         raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
+    if versions.is_version(target.parent):
+        raise StoreError(f"{target} lies in a version of a store; expected a URL outside of it")
     try:
         # Read the tag first: if the pointer moves in between, the old tag will not match.
         tag = str((target / versions.POINTER).entry().get("ETag", ""))

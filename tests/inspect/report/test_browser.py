@@ -179,8 +179,9 @@ def test_a_good_verdict_is_no_more_than_it_rests_on(opened):
     assert cut(opened) == []
     unusual = opened.find_elements("css selector", "#statelist .chip")[-1]
     assert unusual.text == "⚠ unusual 1"
-    unusual.click()
-    assert rows(opened) == ["cup"]
+    # A page that still moves would have a pointer miss it.
+    opened.execute_script("arguments[0].click()", unusual)
+    wait(lambda: rows(opened) == ["cup"])
     row = opened.find_element("css selector", "tbody tr:not(.space)")
     assert "⚠" in row.text and f"unusual masks: {HOSTILE}" in row.text
     row.click()
