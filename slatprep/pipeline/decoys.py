@@ -24,6 +24,7 @@ from slatprep.pipeline.measured import (
     Decoy,
     Kept,
     MeasuredErrors,
+    count_objects,
     measured_errors,
     why_no_decoys,
     writable_file,
@@ -108,7 +109,8 @@ def measure_errors(
         if not os.access(there, os.W_OK):
             raise StoreError(f"{there}: cannot be written to; expected a folder for {file}")
     keys, grids, evidence = _evidence_of(store)
-    if not (wanted := draw_decoys(store, keys, grids, decoys, seed)):
+    objects = unrelated_objects(store, grids)
+    if not (wanted := draw_decoys(store, keys, objects, decoys, seed)):
         raise StoreError(f"{store.path}: decoys need two objects that share neither grid nor SLAT")
     measured = before or measured_errors(store.path)
     known = {(one.grid, one.slat, one.keys): one for one in measured.decoys} if measured else {}
@@ -120,7 +122,6 @@ def measure_errors(
     for number, decoy in counted(results, len(missing), progress):
         found[number] = decoy
     made = tuple(one for one in found if one.evidence)
-    objects = _unrelated(store, grids)
     rates = error_rates(
         evidence,
         np.array([one.evidence for one in made], dtype=np.float64),
@@ -160,8 +161,7 @@ def measure_build(
     """
     measured = measured_errors(store.path) or (measured_errors(before.path) if before else None)
     new = min(allowed_decoys(aligned), most)
-    objects = len(set(map(str, store.column("object_id"))))
-    if new == 0 or objects < LEAST_TARGETS or why_no_decoys(store):
+    if new == 0 or count_objects(store) < LEAST_TARGETS or why_no_decoys(store):
         if measured:
             write_errors(store, measured)
         return
@@ -201,16 +201,14 @@ def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.fl
 
 
 def draw_decoys(
-    store: Store, keys: Mapping[str, str], grids: Sequence[str], count: int, seed: int
+    store: Store, keys: Mapping[str, str], objects: Sequence[str], count: int, seed: int
 ) -> list[Decoy]:
     """Draw grids by a hash of their ids, and for each another object's SLAT of the nearest size.
 
-    No asset of the other object shares a SLAT, or by the digests of `grids` a grid, with one of the
-    grid's object. Each object has one decoy before any has two, and none the same other object
-    twice.
+    `objects` are those of `unrelated_objects`. Each has one decoy before any has two, and none the
+    same other object twice.
     """
-    ids, objects = store.ids, _unrelated(store, grids)
-    sizes = np.diff(store.offsets).tolist()
+    ids, sizes = store.ids, np.diff(store.offsets).tolist()
     by_hash = sorted(range(len(ids)), key=lambda row: _hash(seed, ids[row]))
     # The sort is stable, so assets of equal size are in the order of their hashes.
     by_size = sorted(by_hash, key=sizes.__getitem__)
@@ -233,8 +231,11 @@ def draw_decoys(
     return drawn
 
 
-def _unrelated(store: Store, grids: Sequence[str]) -> list[str]:
-    """Return the object of each row; objects that share a SLAT or a grid have the same name."""
+def unrelated_objects(store: Store, grids: Sequence[str]) -> list[str]:
+    """Return the object of each row; objects that share a SLAT or a grid have the same name.
+
+    `grids` are digests of the rows' grids, empty if they are unknown.
+    """
     objects, slats = list(map(str, store.column("object_id"))), slat_contents(store)
     same: dict[str, str] = {}  # the name of each object's relative, itself for the first one
 

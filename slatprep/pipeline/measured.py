@@ -150,7 +150,7 @@ class MeasuredErrors:
 
 def why_no_decoys(store: Store) -> str:
     """Say why a store can have no decoys; empty if it can."""
-    if len(set(map(str, store.column("object_id")))) < 2:
+    if count_objects(store) < 2:
         return "decoys need at least two objects, and it has one"
     if str(Engine.KNOWN) in store.column("engine"):
         return "its transforms were given, so decoys of it cannot be aligned"
@@ -190,12 +190,17 @@ def errors_of(store: Store) -> MeasuredErrors | None:
     return measured if still else None
 
 
+def count_objects(store: Store) -> int:
+    """Return the number of a store's objects."""
+    return len(set(map(str, store.column("object_id"))))
+
+
 def told_of(store: Store) -> list[str]:
     """Return sentences on what is known of a store's errors, or on why nothing is known."""
     if (measured := errors_of(store)) is None:
         if reason := why_no_decoys(store):
             return [f"not measured: {reason}"]
-        few = len(set(map(str, store.column("object_id")))) < LEAST_TARGETS
+        few = count_objects(store) < LEAST_TARGETS
         too = f", and so does a build of {LEAST_TARGETS} objects or more" if few else ""
         return [f"not measured; `slatprep measure-errors` does it{too}"]
     told = measured.sentences()

@@ -15,7 +15,12 @@ from slatprep.errors import StoreError
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
-from slatprep.pipeline.decoys import allowed_decoys, draw_decoys, measure_errors
+from slatprep.pipeline.decoys import (
+    allowed_decoys,
+    draw_decoys,
+    measure_errors,
+    unrelated_objects,
+)
 from slatprep.pipeline.measured import measured_errors, told_of
 from slatprep.store import Store, open_store
 from slatprep.store.records import ERRORS, manifests_of
@@ -43,10 +48,10 @@ def test_decoys_are_of_other_objects_and_are_aligned_once(store):
 
 
 def test_decoys_are_drawn_by_ids_and_seed_with_the_slat_of_the_nearest_size(store):
-    keys, grids = dict.fromkeys(store.ids, ""), [""] * len(store)
-    few, more, drawn = (draw_decoys(store, keys, grids, count, 1) for count in (2, 4, 100))
+    keys, own = dict.fromkeys(store.ids, ""), unrelated_objects(store, [""] * len(store))
+    few, more, drawn = (draw_decoys(store, keys, own, count, 1) for count in (2, 4, 100))
     assert drawn[:4] == more and more[:2] == few
-    assert [one.grid for one in draw_decoys(store, keys, grids, 100, 2)] != [
+    assert [one.grid for one in draw_decoys(store, keys, own, 100, 2)] != [
         one.grid for one in drawn
     ]
     sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
@@ -84,9 +89,9 @@ def test_each_object_has_a_decoy_before_any_has_two_and_meets_no_other_twice(
     build_store(dataset.parameters(), out)
     store = open_store(out)
     objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
-    _, grids, _ = decoys._evidence_of(store)
+    own = unrelated_objects(store, decoys._evidence_of(store)[1])
     for seed in range(6):
-        drawn = draw_decoys(store, dict.fromkeys(store.ids, ""), grids, 99, seed)
+        drawn = draw_decoys(store, dict.fromkeys(store.ids, ""), own, 99, seed)
         assert sorted(objects[one.grid] for one in drawn[:4]) == ["a", "b", "c", "d"]
         met = [(objects[one.grid], objects[one.slat]) for one in drawn]
         assert len(set(met)) == len(met) == 3 + 3
