@@ -165,7 +165,8 @@ def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
 
 
 @pytest.mark.parametrize(
-    ("agree", "opposite", "taken"), [(6, 4, 0.6), (5, 5, 0), (40, 0, 1), (40, 2, 0.95)]
+    ("agree", "opposite", "taken"),
+    [(6, 4, 0.6), (5, 4, 0.55), (6, 5, 0), (5, 5, 0), (40, 0, 1), (40, 2, 0.95)],
 )
 def test_ties_of_a_dataset_of_two_frames_are_no_surer_than_its_counts(agree, opposite, taken):
     """Half a turn apart, both of a tie's placements are frames of the dataset."""

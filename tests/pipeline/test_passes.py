@@ -18,6 +18,8 @@ from slatprep.judge import THRESHOLDS
 from slatprep.parameters import BuildParameters, ConsensusParameters, WitnessParameters
 from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.pipeline.notices import shared_rotation
+from slatprep.pipeline.passes import apply_consensus
+from slatprep.pipeline.plan import Crew
 from slatprep.pipeline.rows import NextStore, Row, SourceStore
 
 SETTLED = ConsensusParameters(settle=True)
@@ -65,6 +67,16 @@ def test_more_symmetric_assets_are_placed_right_and_no_other_changes(habitual, a
         if not alone[asset_id]["alignment"]["placements"]:
             assert together[asset_id]["alignment"] == alone[asset_id]["alignment"]
             assert_same_labels(agreed, row)
+
+
+@pytest.mark.parametrize("objects", [1, 4])
+def test_assets_of_few_objects_share_no_rotation(objects):
+    """Five objects are needed, and a column of the rows says which they are of."""
+    columns = {"transform": np.eye(4), "verdict": "good", "n_placements": 0}
+    rows = [Row(f"{k}", 1, columns=columns | {"object_id": f"{k % objects}"}) for k in range(40)]
+    told: list[str] = []
+    assert apply_consensus(rows, None, Crew(1, note=told.append)) is rows
+    assert told == ["consensus: too few objects share a rotation; 0 tied ones stay"]
 
 
 def test_what_was_settled_is_recorded_and_can_be_undone(agreed):
