@@ -213,13 +213,18 @@ def is_proper(deformation: Deformation) -> bool:
 
 def _least_stretch(deformation: Deformation, steps: int) -> float:
     """Return the minimum of 2 det / |J|^2 over a grid of `steps` points per span."""
-    control = deformation.coefficients / deformation.spacing
-    axes = [_splines(count, steps) for count in control.shape[:3]]
-    splines = ([both[axis == along] for axis, both in enumerate(axes)] for along in range(3))
-    slopes = [np.einsum("ijkx,ia,jb,kc->xabc", control, *s, optimize=True) for s in splines]
-    matrix = deformation.affine[:, :3].T[..., None, None, None]
-    a, b, c = np.stack(slopes) + matrix  # rows: the derivatives along each axis
-    determinant = (a * np.cross(b, c, axis=0)).sum(axis=0)
+    control = np.moveaxis(deformation.coefficients / deformation.spacing, -1, 0)
+    (x, dx), (y, dy), (z, dz) = (_splines(count, steps) for count in control.shape[1:])
+    # Shared products of matrices take a tenth of the time of three calls of einsum.
+    level, steep = control @ z, control @ dz
+    parts = (dx, y.T @ level), (x, dy.T @ level), (x, y.T @ steep)
+    columns = deformation.affine[:, :3].T[..., None, None, None]
+    a, b, c = (
+        np.moveaxis(np.tensordot(along, rest, (0, 1)), 1, 0) + column
+        for (along, rest), column in zip(parts, columns, strict=True)
+    )  # the derivatives along each axis
+    turns = (0, 1, 2), (1, 2, 0), (2, 0, 1)
+    determinant = sum(a[i] * (b[j] * c[k] - b[k] * c[j]) for i, j, k in turns)
     return float((2.0 * determinant / (a**2 + b**2 + c**2).sum(axis=0)).min())
 
 
