@@ -30,6 +30,9 @@ _ONLY_FOR = {
 }
 
 
+_HALF = "{} holds files of the old export, the new one, or both; run it again"
+
+
 @dataclass(frozen=True, kw_only=True)
 class FormatOptions:
     """Options of some formats; None takes the format's own default.
@@ -130,7 +133,7 @@ def export(
         verdicts = USABLE
     if split != "all":
         assets = tuple(opened.ids[row] for row in rows)
-    output.if_stopped = f"{out} holds files of the old export, the new one, or both; run it again"
+    output.if_stopped = _HALF.format(out)
     with output.progress("export") as progress:
         summary = export_store(
             opened,
@@ -204,6 +207,7 @@ def publish(
         )
     opened = options.opened(store)
     drawn = {"assets.png": _picture(opened, pictures)} if pictures and len(opened) else {}
+    output.if_stopped = _HALF.format(out)
     with output.progress("publish") as progress:
         summary = publish_store(
             opened,

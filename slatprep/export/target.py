@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -103,22 +103,32 @@ def _names_below(directory: Path) -> Iterator[str]:
 def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) -> None:
     """Replace the files of an old export by those of a new one; keep all other files."""
     names = sorted(_names_below(new), key=lambda name: (name == INDEX, name))
-    folders = {name for name in names if (out / name).is_dir() and not (new / name).is_dir()}
-    if taken := sorted(others.intersection(names) | folders):
+    folders = {name for name in names if (new / name).is_dir()}
+    there = {name for name in names if (out / name).is_dir() and not (out / name).is_symlink()}
+    if taken := sorted(others.intersection(names) - (folders & there) | there - folders):
         raise ConfigError(
             f"{out / taken[0]} is of no export of slatprep, and the new export has a "
             "file of this name; move it away, or export to a new path"
         )
     flush_tree(new)
-    # Only names found below `out`: the index may contain any path.
-    for name in own.intersection(_names_below(out)).difference(names):
-        if not (out / name).is_dir():
-            (out / name).unlink()
-    for name in names:  # The index comes last.
-        if (new / name).is_dir():
-            (out / name).mkdir(exist_ok=True)
-        else:
+    # If this is stopped, the next export knows the files of both.
+    index = json.loads((new / INDEX).read_bytes())
+    with staged(out / INDEX) as path:
+        path.write_bytes(orjson.dumps(index | {"files": sorted(own.union(names) - {INDEX})}))
+    for name in names[:-1]:
+        if name not in folders:
             (new / name).replace(out / name)
+        elif name not in there:
+            (out / name).unlink(missing_ok=True)
+            (out / name).mkdir()
+    # Only names found below `out`: the index may contain any path. Files come before their folders.
+    for name in sorted(own.intersection(_names_below(out)).difference(names), reverse=True):
+        if (out / name).is_dir():
+            with suppress(OSError):  # Other files lie in it.
+                (out / name).rmdir()
+        else:
+            (out / name).unlink()
+    (new / INDEX).replace(out / INDEX)
     flush(out)
 
 

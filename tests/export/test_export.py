@@ -206,6 +206,60 @@ def test_a_file_of_another_origin_is_not_replaced(store, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["index.json", "latents", "metadata.csv"]
 
 
+def made(out: Path, *names: str) -> None:
+    """Export files of these names, which also are their content."""
+    with directory(out, "ply") as new:
+        for name in names:
+            (new / name).parent.mkdir(parents=True, exist_ok=True)
+            (new / name).write_text(name)
+        about = {"format": target.FORMAT, "kind": "ply", "files": names}
+        target.write_index(new, about, [])
+
+
+def test_folders_of_an_export_come_and_go_beside_other_files(tmp_path):
+    out = tmp_path / "out"
+    made(out, "a/b/x", "a/c/y", "d")
+    (out / "a" / "mine").touch()
+    made(out, "e", "d/x")
+    assert set(bytes_of(out)) == {"a/mine", "e", "d/x", "index.json"}
+    assert {path.name for path in out.rglob("*") if path.is_dir()} == {"a", "d"}
+    made(out, "a/b/x", "a/c/y")
+    assert set(bytes_of(out)) == {"a/mine", "a/b/x", "a/c/y", "index.json"}
+    (tmp_path / "elsewhere").mkdir()
+    (out / "f").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ConfigError, match=r"out/f is of no export of slatprep"):
+        made(out, "f/x")
+    assert not any((tmp_path / "elsewhere").iterdir())
+
+
+@pytest.mark.parametrize("moves", range(5))
+def test_an_export_stopped_beside_other_files_keeps_the_old_ones_and_is_made_again(
+    moves, tmp_path, monkeypatch
+):
+    out, move, left = tmp_path / "out", Path.replace, [moves]
+    made(out, "a/x", "b", "c/y")
+    (out / "mine").touch()
+
+    def stopped(path: Path, to: Path) -> Path:
+        if "export" in path.parts:
+            left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return move(path, to)
+
+    monkeypatch.setattr(Path, "replace", stopped)
+    new = ("a/z", "b", "d/y", "e")
+    with pytest.raises(KeyboardInterrupt):
+        made(out, *new)
+    monkeypatch.undo()
+    old = {"a/x", "c/y"} if moves < len(new) else set()
+    assert set(bytes_of(out)) >= {"mine", "b", "index.json", *old, *new[:moves]}
+    made(out, *new)
+    assert bytes_of(out).keys() == {"mine", "index.json", *new}
+    made(out, "g")
+    assert bytes_of(out).keys() == {"mine", "index.json", "g"}
+
+
 @pytest.mark.parametrize("format", ["hdf5", "usd"])
 def test_a_disk_that_is_full_ends_no_process(format, store, tmp_path):
     """A limit on the size of files refuses writes as a full disk does; HDF5 crashes of either."""
