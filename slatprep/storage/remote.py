@@ -10,10 +10,10 @@ The libraries find credentials and endpoints; for S3, for instance, in ``AWS_*``
 from __future__ import annotations
 
 import errno
-import glob
 import io
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, Self
 
@@ -284,11 +284,28 @@ def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str])
 
 def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
     """Remove objects below a place by their names; missing ones are no error."""
-    if names := list(names):
-        with connected(place) as (system, root):
-            # fsspec takes each of these for a pattern, and ``a[1]`` would stand for ``a1``.
-            system.rm([glob.escape(f"{root}/{name}") for name in names])
+    # Not by fsspec's `rm`, which lists folders to find out what a name with ``*`` or ``[`` means.
+    with connected(place) as (system, root):
+        bucket, _, above = root.partition("/")
 
+        def remove(name: str) -> None:
+            with suppress(FileNotFoundError):
+                system.rm_file(f"{root}/{name}")
+
+        if "s3" not in system.protocol:
+            with ThreadPoolExecutor(16) as pool:
+                list(pool.map(remove, names))
+            return
+        keys = [{"Key": f"{above}/{name}".lstrip("/")} for name in names]
+        for start in range(0, len(keys), _REMOVED_AT_ONCE):
+            some = {"Objects": keys[start : start + _REMOVED_AT_ONCE], "Quiet": True}
+            answer = system.call_s3("delete_objects", Bucket=bucket, Delete=some)
+            for kept in answer.get("Errors", ()):
+                raise OSError(errno.EACCES, kept["Message"], kept["Key"])
+
+
+_REMOVED_AT_ONCE = 1000
+"""Largest number of objects that S3 removes in one request."""
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 """Advice if S3 finds no credentials."""
