@@ -2,6 +2,7 @@
 
 import errno
 import multiprocessing
+import pickle
 import shutil
 import tempfile
 import threading
@@ -31,6 +32,7 @@ from slatprep.pipeline.dataset import build_store, plan_build
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer
+from slatprep.store.shard_reader import UnreachableError
 from slatprep.store.shard_writer import ShardWriter
 
 
@@ -188,6 +190,45 @@ def test_each_fault_of_a_store_is_named(s3, url, undisturbed):
     s3.rm(f"{version}/zarr.json")
     with pytest.raises(StoreError, match=f"{version}/zarr.json does not exist"):
         verify_store(url)
+
+
+@pytest.mark.parametrize("error", [OSError("connection lost"), PermissionError("Denied")])
+@pytest.mark.parametrize("lost", [
+    "voxel/feats/c/0", "asset/id/c/0", "file/sha256/c/0", "voxel/coords/zarr.json",
+])  # fmt: skip
+def test_what_the_server_does_not_give_is_not_called_damaged(
+    url, undisturbed, change_client, error, lost
+):
+    put(undisturbed[1], url)
+    client = raising(error, S3FileSystem._cat_file, lambda path, options: lost in path)
+    change_client("_cat_file", client)
+    told = rf"{lost}.*: cannot be read \({error}.*check the network and your permissions"
+    with pytest.raises(UnreachableError, match=told) as caught:
+        verify_store(url)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    if not lost.endswith("zarr.json"):
+        with pytest.raises(UnreachableError, match=told):
+            open_store(url).read_rows(lost.removesuffix("/0").removesuffix("/c"), 0, 1)
+
+
+def test_without_the_right_to_list_what_was_never_written_is_denied(
+    url, undisturbed, change_client
+):
+    put(undisturbed[1], url)
+    denied = raising(
+        PermissionError("Denied"), S3FileSystem._cat_file, lambda path, _: gone in path
+    )
+    gone = "asset/category/c/0"
+    change_client("_cat_file", denied)
+    assert open_store(url).column("category").tolist() == [""] * 3
+
+
+def test_a_version_that_is_gone_has_to_be_opened_again(s3, url, undisturbed):
+    store = open_store(put(undisturbed[1], url))
+    store.read(0)
+    s3.rm(str(store.path), recursive=True)
+    with pytest.raises(StoreError, match=r"c/0.* is missing \(was the store replaced\? Open it"):
+        store.read(0)
 
 
 @pytest.mark.parametrize("text", [
