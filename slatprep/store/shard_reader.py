@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.parameters import MAX_SHARD_CHUNKS
 from slatprep.records import MAX_NAME_BYTES
+from slatprep.storage.cache import what_to_do
 from slatprep.storage.chunks import (
     MAX_TEXT_BYTES,
     MISSING,
@@ -58,9 +59,7 @@ class DamagedFileError(StoreError):
     """A file of the store in `folder` that is missing, cut short or damaged."""
 
     def __init__(self, folder: str, file: str, fault: str, expected: str) -> None:
-        super().__init__(
-            f"{folder}/{file}: {fault}; expected {expected}. Copy the store again, or build it"
-        )
+        super().__init__(f"{folder}/{file}: {fault}; expected {expected}. {what_to_do(folder)}")
         self.folder, self.file, self.fault, self.expected = folder, file, fault, expected
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str, str]]:

@@ -378,7 +378,7 @@ def test_a_copy_is_made_once_and_no_name_leads_out(s3, url, undisturbed, request
     assert storage_of(undisturbed[1]).copied_version() == undisturbed[1]
 
 
-@pytest.mark.parametrize("how", ["removed", "cut", "emptied"])
+@pytest.mark.parametrize("how", ["removed", "cut", "emptied", "flipped", "a file", "[]", "{}"])
 def test_a_damaged_copy_is_made_again(url, undisturbed, how):
     put(undisturbed[1], url)
     copy = Path(str(open_store(url, copy=True).path))
@@ -386,12 +386,33 @@ def test_a_damaged_copy_is_made_again(url, undisturbed, how):
     if how == "emptied":
         shutil.rmtree(copy)
         copy.mkdir()
+    elif how == "a file":
+        shutil.rmtree(copy)
+        copy.write_text("")
     elif how == "cut":
         file.write_bytes(file.read_bytes()[:-1])
+    elif how == "flipped":
+        root = (copy / "zarr.json").read_bytes()
+        (copy / "zarr.json").write_bytes(root.replace(b"slatprep", b"slatpreq"))
     else:
         file.unlink()
+        if how in ("[]", "{}"):
+            copy.with_name(".demo.zarr.sizes").write_text(how)
     assert Path(str(open_store(url, copy=True).path)) == copy
     assert tree(copy) == tree(undisturbed[1])
+
+
+def test_a_damaged_shard_of_a_copy_says_what_to_remove(url, undisturbed, monkeypatch):
+    monkeypatch.setattr("slatprep.storage.cache.SMALL_BYTES", 0)
+    put(undisturbed[1], url)
+    copy = Path(str(open_store(url, copy=True).path))
+    shard = bytearray((copy / "voxel/feats/c/0/0").read_bytes())
+    shard[100] ^= 1
+    (copy / "voxel/feats/c/0/0").write_bytes(shard)
+    with pytest.raises(StoreError, match=f"damaged.* Remove {copy}, a copy, and open the store"):
+        open_store(url, copy=True).read(0)
+    shutil.rmtree(copy)
+    assert_same(open_store(url, copy=True), open_store(undisturbed[1]))
 
 
 def test_a_copy_that_differs_from_what_was_published_is_none(s3, url, undisturbed, tmp_path):
