@@ -351,7 +351,10 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
     try:
         yield system, str(name)
     except OSError as error:
-        number = error.errno or errno.EIO
+        number, cause = error.errno or errno.EIO, error.__cause__
+        if place.protocol.startswith("http") and cause and getattr(cause, "status", 0) != 404:
+            # Its file system calls a file missing whatever went wrong.
+            raise OSError(errno.EIO, _words(cause), str(place)) from error
         if isinstance(error, FileNotFoundError):
             number = errno.ENOENT
         elif isinstance(error, PermissionError):
@@ -365,5 +368,6 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
 
 
 def _words(error: object) -> str:
-    words = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    told = str(error).partition("\n\nDebug source:")[0]  # obstore adds many lines.
+    words = " ".join(told.split()).rstrip(".") or type(error).__name__
     return f"{words}; {_CREDENTIALS}" if "locate credentials" in words else words

@@ -231,6 +231,19 @@ def test_a_version_that_is_gone_has_to_be_opened_again(s3, url, undisturbed):
         store.read(0)
 
 
+@pytest.mark.parametrize("obstore", ["yes", "no"])
+def test_a_bucket_or_server_that_is_not_there_is_told(bucket, server, monkeypatch, obstore):
+    monkeypatch.setenv("SLATPREP_OBSTORE", obstore)
+    for url, told in (
+        ("s3://no-such/x", "^s3://no-such/x is not a slatprep store: its bucket does not exist;"),
+        (f"s3://{bucket}/x", f"store: s3://{bucket}/x/zarr.json does not exist;"),
+        (f"{server}/{bucket}/x", f"store: {server}/{bucket}/x/zarr.json does not exist;"),
+        ("http://127.0.0.1:1/x", "^http://127.0.0.1:1/x: cannot be reached .*connect"),
+    ):
+        with pytest.raises(StoreError, match=told):
+            open_store(url)
+
+
 @pytest.mark.parametrize("text", [
     b"", b"{", b"[]", b'{"format": "other"}', b"[" * 100_000,
     *(Pointer(*names, "", "").encode() for names in (("../../x", ""), ("0123456789abcdef", ".."))),
