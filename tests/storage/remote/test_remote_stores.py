@@ -29,6 +29,7 @@ from slatprep.inspect.overview import overview_of
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.decoys import measure_errors
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer
@@ -340,6 +341,13 @@ def test_records_nobody_can_ask_for_end_a_command_in_words(url, another, change_
     told = refused("subset", url, "--asset", "z", "--out", tmp_path / "s.zarr", code=1)
     assert "connection lost" in told
     assert not (tmp_path / "s.zarr").exists()
+
+
+def test_errors_measured_where_nothing_may_be_written_are_told(url, undisturbed, change_client):
+    put(undisturbed[1], url)
+    change_client("_put_file", raising(PermissionError("Access Denied")))
+    with pytest.warns(UserWarning, match=r"decoys.json: .* could not be kept \(Access Denied\)"):
+        assert measure_errors(open_store(url), decoys=1).decoys
 
 
 def test_an_error_that_no_room_has_words_for_is_one_line(another, monkeypatch):
