@@ -60,8 +60,11 @@ def test_a_source_is_never_replaced_on_s3_either(s3, url, undisturbed):
     for source in (url, str(open_store(url).path)):
         with pytest.raises(ConfigError, match="is a store to take assets from"):
             subset_store(source, url, ["a"])
-    with pytest.raises(StoreError, match="lies in a version of a store"):
-        subset_store(undisturbed[1], f"{open_store(url).path}/inner.zarr", ["a"])
+    own = open_store(url).path
+    for inner in (own / "inner", f"{url}/versions/a/b", f"{url}/manifests/x.zarr", f"{url}/spool"):
+        with pytest.raises(StoreError, match=f"{inner} lies in the store {url}; expected"):
+            subset_store(undisturbed[1], inner, ["a"])
+    assert subset_store(undisturbed[1], url.replace("stores", "manifests"), ["a"]).complete
     assert versions(s3, url) == before
     assert subset_store(url, f"{url}.zarr", ["a"]).complete
 
