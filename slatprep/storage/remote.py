@@ -266,19 +266,22 @@ def pinned(place: RemotePlace) -> RemotePlace:
         return RemotePlace("hf", PurePosixPath(base, at.path_in_repo))
 
 
-def put_objects(folder: Path, place: RemotePlace, names: Iterable[str], at_once: int = 16) -> None:
-    """Put files of a folder below a place, under the same names, several at a time."""
-    if names := list(names):
-        with connected(place) as (system, root):
-            options, files = multipart_options(system, at_once), [str(folder / n) for n in names]
-            system.put(files, [f"{root}/{name}" for name in names], **options)
+def put_objects(folder: Path, place: RemotePlace, names: Iterable[str]) -> None:
+    """Put small files of a folder below a place, under the same names, several at a time."""
+    with connected(place) as (system, root), ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
+
+        def put(name: str) -> None:
+            system.put_file(str(folder / name), f"{root}/{name}", **multipart_options(system))
+
+        # If one fails, the others are not begun; fsspec's `put` would warn of each.
+        list(pool.map(put, names))
 
 
 def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str]) -> None:
     """Have the server copy objects below a place to another, under the same names."""
     if names := list(names):
         with connected(source) as (system, root), connected(target) as (_, other):
-            options = {"batch_size": 16} if system.async_impl else {}
+            options = {"batch_size": _FILES_AT_ONCE} if system.async_impl else {}
             system.copy([f"{root}/{n}" for n in names], [f"{other}/{n}" for n in names], **options)
 
 
@@ -293,7 +296,7 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
                 system.rm_file(f"{root}/{name}")
 
         if "s3" not in system.protocol:
-            with ThreadPoolExecutor(16) as pool:
+            with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
                 list(pool.map(remove, names))
             return
         keys = [{"Key": f"{above}/{name}".lstrip("/")} for name in names]
@@ -304,8 +307,8 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
                 raise OSError(errno.EACCES, kept["Message"], kept["Key"])
 
 
-_REMOVED_AT_ONCE = 1000
-"""Largest number of objects that S3 removes in one request."""
+_FILES_AT_ONCE, _REMOVED_AT_ONCE = 16, 1000
+"""Number of requests at a time, and of objects that S3 removes in one of them."""
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 """Advice if S3 finds no credentials."""

@@ -208,7 +208,8 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         small = [name for name in sorted(missing) if files[name] <= _SMALL_BYTES]
         large = [name for name in sorted(missing) if files[name] > _SMALL_BYTES]
         put_objects(new, upload.version, small)
-        put_objects(new, upload.version, large, at_once=1)
+        for name in large:
+            (upload.version / name).upload(new / name)
         if staged.before is not None:
             # An earlier upload may have left some: a version's name implies its content.
             others = [n for n in staged.copied if there.get(n, {}).get("size") != sizes[n]]

@@ -1,6 +1,7 @@
 """Stores that lie on S3: made, replaced in one step, interrupted, read and verified."""
 
 import errno
+import gc
 import multiprocessing
 import pickle
 import shutil
@@ -18,7 +19,7 @@ import pytest
 import zarr
 from botocore.exceptions import FlexibleChecksumError
 from s3fs.core import S3FileSystem
-from support.commands import refused
+from support.commands import document, refused
 from support.faults import inject
 from support.faulty_proxy import Faults, faulty
 from support.remote import current, put, raising, versions
@@ -344,6 +345,24 @@ def test_records_nobody_can_ask_for_end_a_command_in_words(url, another, change_
     told = refused("subset", url, "--asset", "z", "--out", tmp_path / "s.zarr", code=1)
     assert "connection lost" in told
     assert not (tmp_path / "s.zarr").exists()
+
+
+def test_a_command_names_the_url_that_was_given(url, undisturbed, tmp_path):
+    put(undisturbed[1], url)
+    assert document("verify", url)["store"] == url
+    told = refused("publish", url, "--out", tmp_path / "hub")
+    assert f"is on no local disk; `slatprep subset {url}/versions/" in told
+
+
+def test_an_upload_that_fails_ends_in_one_error(url, undisturbed, change_client, recwarn):
+    async def denied(*given: Any, **options: Any) -> None:
+        raise PermissionError("Access Denied")
+
+    change_client("_put_file", denied)
+    with pytest.raises(StoreError, match=r"cannot be written to .*Access Denied"):
+        put(undisturbed[1], url)
+    gc.collect()
+    assert not [one for one in recwarn if "never awaited" in str(one.message)]
 
 
 def test_errors_measured_where_nothing_may_be_written_are_told(url, undisturbed, change_client):
