@@ -89,7 +89,8 @@ def verify(
         found = amount(len(result.findings), "finding") if result.findings else "nothing is wrong"
         say(f"{store}: {found}")
 
-    output.result(result, show, complete=result.ok)
+    # Print the place as it was typed.
+    output.result(replace(result, store=store), show, complete=result.ok)
 
 
 _SHOWN = 20

@@ -64,7 +64,10 @@ def publish_store(
     opened, stated, out = open_store(store), stated or Stated(), Path(out)
     local = storage_of(opened.path).local
     if local is None:
-        raise ConfigError(f"{opened.path} is on no local disk; copy it there to publish it")
+        raise ConfigError(
+            f"{opened.path} is on no local disk; `slatprep subset {opened.path} --verdict all "
+            "--out FOLDER` makes a store there that can be published"
+        )
     require_outside(out)
     assets = len(opened)
     chosen: Sequence[str] = ()

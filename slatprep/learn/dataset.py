@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from slatprep.errors import ConfigError, amount
+from slatprep.errors import ConfigError, StoreError, amount
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
 from slatprep.learn.splits import select_assets
 from slatprep.readers.splits import Shares, Split
@@ -194,7 +194,11 @@ class SlatDataset(Dataset[Item]):
         draw = key if isinstance(key, Draw) else Draw(key, self.epoch)
         if not -len(self) <= draw.number < len(self):
             raise IndexError(f"asset {draw.number} of {len(self)}")
-        rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
+        try:
+            rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
+        except StoreError as error:
+            # PyTorch hands on an error of a worker only if its class takes one text.
+            raise StoreError(str(error)) from error
         asset_id = self.asset_ids[draw.number]
         valid, confidence = rows["valid"], rows["confidence"]
         if self.min_confidence is not None:

@@ -90,7 +90,7 @@ def measure_errors(
     Returns
     -------
     MeasuredErrors
-        The result, which is also written to `file_of` the store.
+        The result, which is also written to `file_of` the store, or a warning tells why not.
 
     Raises
     ------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -12,7 +13,6 @@ from slatprep.errors import StoreError, amount
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.destination import require_free
 from slatprep.records import Engine, Number, Place, Share, Verdict
-from slatprep.storage.atomic import writing
 from slatprep.storage.documents import read_as, read_bounded
 from slatprep.storage.place import storage_of
 from slatprep.store import Store
@@ -222,7 +222,11 @@ def writable_file(store: Place) -> Place:
 
 
 def write_errors(store: Store, measured: MeasuredErrors) -> None:
-    """Write a measurement beside the store."""
+    """Write a measurement beside the store; warn if it cannot be written there."""
     file = writable_file(store.path)
-    with writing(str(file), file.parent), storage_of(file).staged() as path:
-        path.write_bytes(orjson.dumps(measured, option=orjson.OPT_INDENT_2) + b"\n")
+    try:
+        with storage_of(file).staged() as path:
+            path.write_bytes(orjson.dumps(measured, option=orjson.OPT_INDENT_2) + b"\n")
+    except OSError as error:  # It took long, and its reader has it all the same.
+        told = f"{file}: what was measured could not be kept ({error.strerror})"
+        warnings.warn(told, stacklevel=3)

@@ -29,6 +29,10 @@ VARIABLE = "SLATPREP_CACHE"
 """Environment variable with the folder's path."""
 
 
+SMALL_BYTES = 2**18
+"""Largest size of a file whose digest is compared whenever a local copy is opened."""
+
+
 def cache_folder() -> Path:
     """Return the folder: ``$SLATPREP_CACHE``, else ``slatprep`` in the user's own cache."""
     if named := os.environ.get(VARIABLE):
@@ -73,7 +77,8 @@ def short(text: str) -> str:
 def copied_version(place: RemotePlace) -> Path:
     """Return the local copy of a store's version, after making it if needed.
 
-    Versions never change, so a copy is made once, or again if somebody removed or cut its files.
+    Versions never change, so a copy is made once, or again if somebody removed, cut or changed
+    its files; bits that flip in large files are found when they are read.
     StoreError if the place is no version, differs from its pointer, or cannot be copied.
     """
     if not is_version(place):
@@ -110,8 +115,10 @@ def copied_version(place: RemotePlace) -> Path:
                     )
             if not _is_whole(copy, sizes):  # Another process may have been faster.
                 shutil.rmtree(copy, ignore_errors=True)
-                text = {name: entry["size"] for name, entry in objects.items()}
-                Path(own, "sizes").write_bytes(orjson.dumps(text))
+                if copy.is_file():
+                    copy.unlink()
+                kept = {name: _kept_of(part / name) for name in objects}
+                Path(own, "sizes").write_bytes(orjson.dumps(kept))
                 Path(own, "sizes").replace(sizes)
                 part.rename(copy)
     except OSError as error:
@@ -120,9 +127,22 @@ def copied_version(place: RemotePlace) -> Path:
 
 
 def _is_whole(copy: Path, sizes: Path) -> bool:
-    """Return whether a copy has all its files, by their sizes."""
+    """Return whether a copy has all its files, by `_kept_of`."""
     try:
         known = orjson.loads(sizes.read_bytes())
-        return all((copy / name).stat().st_size == size for name, size in known.items())
-    except (OSError, ValueError):
+        return bool(known) and all(_kept_of(copy / name) == own for name, own in known.items())
+    except (OSError, ValueError, AttributeError):
         return False
+
+
+def _kept_of(file: Path) -> int | str:
+    """Return a file's size, or the digest of a small file, such as all metadata."""
+    size = file.stat().st_size
+    return size if size > SMALL_BYTES else file_digest(file)
+
+
+def what_to_do(store: str) -> str:
+    """Return advice for a damaged store, which may be a copy in the cache."""
+    if Path(store).is_relative_to(cache_folder()):
+        return f"Remove {store}, a copy, and open the store again"
+    return "Copy the store again, or build it"

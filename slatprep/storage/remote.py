@@ -10,10 +10,10 @@ The libraries find credentials and endpoints; for S3, for instance, in ``AWS_*``
 from __future__ import annotations
 
 import errno
-import glob
 import io
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, Self
 
@@ -266,29 +266,49 @@ def pinned(place: RemotePlace) -> RemotePlace:
         return RemotePlace("hf", PurePosixPath(base, at.path_in_repo))
 
 
-def put_objects(folder: Path, place: RemotePlace, names: Iterable[str], at_once: int = 16) -> None:
-    """Put files of a folder below a place, under the same names, several at a time."""
-    if names := list(names):
-        with connected(place) as (system, root):
-            options, files = multipart_options(system, at_once), [str(folder / n) for n in names]
-            system.put(files, [f"{root}/{name}" for name in names], **options)
+def put_objects(folder: Path, place: RemotePlace, names: Iterable[str]) -> None:
+    """Put small files of a folder below a place, under the same names, several at a time."""
+    with connected(place) as (system, root), ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
+
+        def put(name: str) -> None:
+            system.put_file(str(folder / name), f"{root}/{name}", **multipart_options(system))
+
+        # If one fails, the others are not begun; fsspec's `put` would warn of each.
+        list(pool.map(put, names))
 
 
 def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str]) -> None:
     """Have the server copy objects below a place to another, under the same names."""
     if names := list(names):
         with connected(source) as (system, root), connected(target) as (_, other):
-            options = {"batch_size": 16} if system.async_impl else {}
+            options = {"batch_size": _FILES_AT_ONCE} if system.async_impl else {}
             system.copy([f"{root}/{n}" for n in names], [f"{other}/{n}" for n in names], **options)
 
 
 def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
     """Remove objects below a place by their names; missing ones are no error."""
-    if names := list(names):
-        with connected(place) as (system, root):
-            # fsspec takes each of these for a pattern, and ``a[1]`` would stand for ``a1``.
-            system.rm([glob.escape(f"{root}/{name}") for name in names])
+    # Not by fsspec's `rm`, which lists folders to find out what a name with ``*`` or ``[`` means.
+    with connected(place) as (system, root):
+        bucket, _, above = root.partition("/")
 
+        def remove(name: str) -> None:
+            with suppress(FileNotFoundError):
+                system.rm_file(f"{root}/{name}")
+
+        if "s3" not in system.protocol:
+            with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
+                list(pool.map(remove, names))
+            return
+        keys = [{"Key": f"{above}/{name}".lstrip("/")} for name in names]
+        for start in range(0, len(keys), _REMOVED_AT_ONCE):
+            some = {"Objects": keys[start : start + _REMOVED_AT_ONCE], "Quiet": True}
+            answer = system.call_s3("delete_objects", Bucket=bucket, Delete=some)
+            for kept in answer.get("Errors", ()):
+                raise OSError(errno.EACCES, kept["Message"], kept["Key"])
+
+
+_FILES_AT_ONCE, _REMOVED_AT_ONCE = 16, 1000
+"""Number of requests at a time, and of objects that S3 removes in one of them."""
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 """Advice if S3 finds no credentials."""
@@ -334,7 +354,10 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
     try:
         yield system, str(name)
     except OSError as error:
-        number = error.errno or errno.EIO
+        number, cause = error.errno or errno.EIO, error.__cause__
+        if place.protocol.startswith("http") and cause and getattr(cause, "status", 0) != 404:
+            # Its file system calls a file missing whatever went wrong.
+            raise OSError(errno.EIO, _words(cause), str(place)) from error
         if isinstance(error, FileNotFoundError):
             number = errno.ENOENT
         elif isinstance(error, PermissionError):
@@ -348,5 +371,6 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
 
 
 def _words(error: object) -> str:
-    words = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    told = str(error).partition("\n\nDebug source:")[0]  # obstore adds many lines.
+    words = " ".join(told.split()).rstrip(".") or type(error).__name__
     return f"{words}; {_CREDENTIALS}" if "locate credentials" in words else words

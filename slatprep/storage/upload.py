@@ -76,9 +76,13 @@ def published_state(target: RemotePlace) -> PublishedState:
     """
     if versions.is_version(target):
         raise StoreError(f"{target} is one version of a store; expected {target.parent.parent}")
-    if versions.is_version(target.parent):
-        raise StoreError(f"{target} lies in a version of a store; expected a URL outside of it")
     try:
+        for above in (target.path, *target.path.parents):
+            store = RemotePlace(target.protocol, above.parent)
+            if above.name in _OWN and above.parent.name and (store / versions.POINTER).exists():
+                raise StoreError(
+                    f"{target} lies in the store {store}; expected a URL outside of it"
+                )
         # Read the tag first: if the pointer moves in between, the old tag will not match.
         tag = str((target / versions.POINTER).entry().get("ETag", ""))
         pointer = versions.read_pointer(target)
@@ -204,7 +208,8 @@ def upload_store(new: Path, before: PublishedState, staged: Staged | None = None
         small = [name for name in sorted(missing) if files[name] <= _SMALL_BYTES]
         large = [name for name in sorted(missing) if files[name] > _SMALL_BYTES]
         put_objects(new, upload.version, small)
-        put_objects(new, upload.version, large, at_once=1)
+        for name in large:
+            (upload.version / name).upload(new / name)
         if staged.before is not None:
             # An earlier upload may have left some: a version's name implies its content.
             others = [n for n in staged.copied if there.get(n, {}).get("size") != sizes[n]]
@@ -245,6 +250,10 @@ def _is_tagged(entry: Mapping[str, Any], file: Path) -> bool | None:
         parts = [hashlib.md5(part) for part in iter(partial(content.read, PART_BYTES), b"")]
     whole = hashlib.md5(b"".join(part.digest() for part in parts))
     return tag == f"{whole.hexdigest()}-{len(parts)}"
+
+
+_OWN = (versions.VERSIONS, versions.MANIFESTS, versions.SPOOL)
+"""Folders below a store."""
 
 
 def _is_ours(name: str) -> bool:

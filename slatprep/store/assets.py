@@ -27,7 +27,7 @@ from slatprep.store import contract
 from slatprep.store.attributes import RootAttributes, read_attributes
 from slatprep.store.contract import NAMES, gate_findings
 from slatprep.store.layout import ARRAYS, ASSET_CHUNK, FILE, MERGED, last_names
-from slatprep.store.shard_reader import BAD_METADATA, DamagedFileError, RowReader
+from slatprep.store.shard_reader import BAD_METADATA, DamagedFileError, RowReader, UnreachableError
 
 if TYPE_CHECKING:
     import pandas
@@ -316,7 +316,7 @@ class AssetTable:
         reader = self.reader(name)
         try:
             return reader.read(start, stop)
-        except DamagedFileError as error:
+        except (DamagedFileError, UnreachableError) as error:
             # Zarr writes no file for fill values alone, such as a column of empty strings.
             may_lack = name.startswith("asset/") and name != "asset/offset"
             if not may_lack or error.file in self._written:

@@ -23,6 +23,7 @@ from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.files import LINK, file_digest, local_files
 from slatprep.storage.place import storage_of
+from slatprep.storage.remote import RemotePlace
 from slatprep.store.attributes import read_attributes, width_findings
 from slatprep.store.contract import (
     GROUPS,
@@ -35,6 +36,7 @@ from slatprep.store.contract import (
 )
 from slatprep.store.layout import ARRAYS, FILE, FILES, MERGED
 from slatprep.store.reader import Store
+from slatprep.store.shard_reader import UnreachableError
 from slatprep.store.shard_writer import Written
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -150,6 +152,8 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
             continue
         try:
             arrays[name] = read_metadata(path / where)
+        except UnreachableError:
+            raise
         except StoreError as error:
             yield Finding(where, "", str(error), "readable metadata")
             continue
@@ -186,6 +190,8 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
     """
     try:
         expected = digests_in(store)
+    except UnreachableError:
+        raise
     except StoreError as error:
         return 0, {Finding("file", "", str(error), "a digest of every file")}
     findings = set()
@@ -232,6 +238,8 @@ def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tupl
     try:
         actual = file_digest(path / name)
     except OSError as error:
+        if isinstance(path, RemotePlace) and not isinstance(error, FileNotFoundError):
+            raise UnreachableError(path, name, str(error.strerror)) from None
         return name, f"cannot be read ({error.strerror})", ""
     return name, "" if actual == digest else "its bytes changed", actual
 

@@ -425,9 +425,10 @@ def _opened_root(path: Place) -> tuple[dict[str, Any], Folder | None]:
         folder = storage_of(path).folder()
         text = bounded(folder.read("zarr.json", MAX_METADATA_BYTES), MAX_METADATA_BYTES)
         document = parse_document(text)
-    except (FileNotFoundError, NotADirectoryError):
+    except (FileNotFoundError, NotADirectoryError) as error:
+        what = "its bucket" if "bucket does not exist" in str(error) else file
         raise StoreError(
-            f"{path} is not a slatprep store: {file} does not exist; build a store with "
+            f"{path} is not a slatprep store: {what} does not exist; build a store with "
             "`slatprep build-store`"
         ) from None
     except PermissionError as error:

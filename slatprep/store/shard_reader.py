@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from slatprep.errors import StoreError
 from slatprep.parameters import MAX_SHARD_CHUNKS
 from slatprep.records import MAX_NAME_BYTES
+from slatprep.storage.cache import what_to_do
 from slatprep.storage.chunks import (
     MAX_TEXT_BYTES,
     MISSING,
@@ -32,6 +33,7 @@ from slatprep.storage.chunks import (
     whole_sizes,
 )
 from slatprep.storage.place import Folder, RangeFile
+from slatprep.storage.remote import RemoteFolder
 from slatprep.store.layout import MAX_RECORD_BYTES, RECORD_ARRAY
 
 OPEN_SHARDS = 512
@@ -57,13 +59,25 @@ class DamagedFileError(StoreError):
     """A file of the store in `folder` that is missing, cut short or damaged."""
 
     def __init__(self, folder: str, file: str, fault: str, expected: str) -> None:
-        super().__init__(
-            f"{folder}/{file}: {fault}; expected {expected}. Copy the store again, or build it"
-        )
+        super().__init__(f"{folder}/{file}: {fault}; expected {expected}. {what_to_do(folder)}")
         self.folder, self.file, self.fault, self.expected = folder, file, fault, expected
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str, str]]:
         return (type(self), (self.folder, self.file, self.fault, self.expected))
+
+
+class UnreachableError(StoreError):
+    """A file of a store that an object store does not give; the `file` itself may be whole."""
+
+    def __init__(self, folder: object, file: str, fault: str) -> None:
+        super().__init__(
+            f"{folder}/{file}: cannot be read ({fault}); check the network and your permissions, "
+            "and run again"
+        )
+        self.folder, self.file, self.fault = str(folder), file, fault
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        return (type(self), (self.folder, self.file, self.fault))
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +221,7 @@ class RowReader:
         try:
             return file.pread(length, offset)
         except OSError as error:
-            raise self._damaged(number, f"cannot be read ({error.strerror})") from None
+            raise self._unread(number, error) from None
 
     def _scratch(self) -> NDArray[Any]:
         """Return this thread's memory for a chunk of which only some rows are wanted."""
@@ -225,15 +239,8 @@ class RowReader:
         try:
             file = self.folder.open(self.key(number))
             shard = _Shard(file, self._index(number, file, file.size()))
-        except FileNotFoundError:
-            raise self._damaged(number, "is missing (was the store replaced?)") from None
         except OSError as error:
-            if error.errno in (errno.EMFILE, errno.ENFILE):
-                raise StoreError(
-                    f"{self.folder.path}/{self.key(number)}: cannot be opened ({error.strerror}); "
-                    "raise the limit (ulimit -n), or close other files"
-                ) from None
-            raise self._damaged(number, f"cannot be read ({error.strerror})") from None
+            raise self._unread(number, error) from None
         # Two threads may have opened the shard; either result may stay.
         self._shards[number] = shard
         _OPENED.append((weakref.ref(self), number))
@@ -260,6 +267,20 @@ class RowReader:
         if (offset > size).any() or (length_of > np.minimum(size, limit)).any():
             raise self._damaged(number, "its index leads out of it")
         return index
+
+    def _unread(self, number: int, error: OSError) -> StoreError:
+        """Return the error for a file that cannot be opened or read."""
+        file, fault = self.key(number), error.strerror or str(error)
+        if isinstance(error, FileNotFoundError):
+            return self._damaged(number, "is missing (was the store replaced? Open it again)")
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            return StoreError(
+                f"{self.folder.path}/{file}: cannot be opened ({fault}); "
+                "raise the limit (ulimit -n), or close other files"
+            )
+        if isinstance(self.folder, RemoteFolder):
+            return UnreachableError(self.folder.path, file, fault)
+        return self._damaged(number, f"cannot be read ({fault})")
 
     def _damaged(self, number: int, fault: str) -> DamagedFileError:
         return DamagedFileError(self.folder.path, self.key(number), fault, "the file as written")

@@ -128,7 +128,7 @@ def test_a_lost_file_of_a_column_is_named_and_one_never_written_is_fine(copy):
     (copy / "asset/verdict/c/0").unlink()
     for words in (("info",), ("list",), ("stats",), ("diff", copy)):
         told = refused(words[0], copy, *words[1:], code=1)
-        assert f"{copy}/asset/verdict/c/0: is missing (was the store replaced?)" in told
+        assert f"{copy}/asset/verdict/c/0: is missing (was the store replaced? Open" in told
 
 
 def test_a_misspelt_command_is_told_with_the_one_meant():

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from s3fs.core import S3FileSystem
 from support.commands import refused
 
 from slatprep import ConfigError, open_store
@@ -19,6 +20,7 @@ from slatprep.storage.ranges import range_reader
 from slatprep.storage.remote import (
     RemoteFile,
     RemotePlace,
+    connected,
     copy_objects,
     list_objects,
     put_objects,
@@ -137,6 +139,27 @@ def test_no_name_stands_for_others(s3, bucket, tmp_path, name):
         remove_objects(one, ["x"])
         assert not (one / "x").exists()
     assert all(s3.cat_file(f"{bucket}/{folder}/x") == b"x" for folder in ("a1", "a2"))
+
+
+@pytest.mark.parametrize("name", ["a1", "a*[1]?{2}"])
+@pytest.mark.parametrize("protocol", ["s3", "memory"])
+def test_objects_are_removed_by_name_whatever_it_is(bucket, protocol, name, requests):
+    place = place_of(f"{protocol}://{bucket}/{name}")
+    with connected(place) as (system, root):
+        for key in ("x", "y", "z/z*"):
+            system.pipe_file(f"{root}/{key}", b"x")
+        requests.made.clear()
+        remove_objects(place, ["x", "z/z*", *map(str, range(2000))])
+        assert requests.made == []  # No folder is listed; the removal itself is not counted.
+        assert [*list_objects(place)] == ["y"]
+        remove_objects(place, [])
+
+
+def test_an_object_that_the_server_keeps_is_an_error(bucket, s3, new_clients, monkeypatch):
+    kept = {"Errors": [{"Key": "x", "Code": "AccessDenied", "Message": "Access Denied"}]}
+    monkeypatch.setattr(S3FileSystem, "call_s3", lambda *args, **options: kept)
+    with pytest.raises(OSError, match=f"Access Denied.*s3://{bucket}/a"):
+        remove_objects(place_of(f"s3://{bucket}/a"), ["x"])
 
 
 def test_a_file_that_is_too_large_is_not_read_whole(s3, bucket, monkeypatch):

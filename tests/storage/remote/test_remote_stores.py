@@ -1,7 +1,9 @@
 """Stores that lie on S3: made, replaced in one step, interrupted, read and verified."""
 
 import errno
+import gc
 import multiprocessing
+import pickle
 import shutil
 import tempfile
 import threading
@@ -17,7 +19,7 @@ import pytest
 import zarr
 from botocore.exceptions import FlexibleChecksumError
 from s3fs.core import S3FileSystem
-from support.commands import refused
+from support.commands import document, refused
 from support.faults import inject
 from support.faulty_proxy import Faults, faulty
 from support.remote import current, put, raising, versions
@@ -28,9 +30,11 @@ from slatprep.inspect.overview import overview_of
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import StoreParameters
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.decoys import measure_errors
 from slatprep.storage.place import place_of, storage_of
 from slatprep.storage.upload import published_state, upload_store
 from slatprep.storage.versions import Pointer
+from slatprep.store.shard_reader import UnreachableError
 from slatprep.store.shard_writer import ShardWriter
 
 
@@ -57,8 +61,11 @@ def test_a_source_is_never_replaced_on_s3_either(s3, url, undisturbed):
     for source in (url, str(open_store(url).path)):
         with pytest.raises(ConfigError, match="is a store to take assets from"):
             subset_store(source, url, ["a"])
-    with pytest.raises(StoreError, match="lies in a version of a store"):
-        subset_store(undisturbed[1], f"{open_store(url).path}/inner.zarr", ["a"])
+    own = open_store(url).path
+    for inner in (own / "inner", f"{url}/versions/a/b", f"{url}/manifests/x.zarr", f"{url}/spool"):
+        with pytest.raises(StoreError, match=f"{inner} lies in the store {url}; expected"):
+            subset_store(undisturbed[1], inner, ["a"])
+    assert subset_store(undisturbed[1], url.replace("stores", "manifests"), ["a"]).complete
     assert versions(s3, url) == before
     assert subset_store(url, f"{url}.zarr", ["a"]).complete
 
@@ -126,9 +133,12 @@ def test_one_older_version_is_kept_or_more_are_told(s3, url, undisturbed, anothe
     third = upload_store(another[1], published_state(place_of(url)))
     assert third.version.name != first.name
     told = r"older versions could not be removed \(Access Denied\)"
+
+    def denied(*args: Any, **options: Any) -> None:
+        raise PermissionError("Access Denied")
+
     with pytest.MonkeyPatch.context() as client, pytest.warns(UserWarning, match=told):
-        client.setattr(S3FileSystem, "_rm", raising(PermissionError("Access Denied")))
-        new_clients()
+        client.setattr(S3FileSystem, "call_s3", denied)
         third.publish()
     new_clients()
     assert current(s3, url) == tree(another[1])
@@ -185,6 +195,58 @@ def test_each_fault_of_a_store_is_named(s3, url, undisturbed):
     s3.rm(f"{version}/zarr.json")
     with pytest.raises(StoreError, match=f"{version}/zarr.json does not exist"):
         verify_store(url)
+
+
+@pytest.mark.parametrize("error", [OSError("connection lost"), PermissionError("Denied")])
+@pytest.mark.parametrize("lost", [
+    "voxel/feats/c/0", "asset/id/c/0", "file/sha256/c/0", "voxel/coords/zarr.json",
+])  # fmt: skip
+def test_what_the_server_does_not_give_is_not_called_damaged(
+    url, undisturbed, change_client, error, lost
+):
+    put(undisturbed[1], url)
+    client = raising(error, S3FileSystem._cat_file, lambda path, options: lost in path)
+    change_client("_cat_file", client)
+    told = rf"{lost}.*: cannot be read \({error}.*check the network and your permissions"
+    with pytest.raises(UnreachableError, match=told) as caught:
+        verify_store(url)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    if not lost.endswith("zarr.json"):
+        with pytest.raises(UnreachableError, match=told):
+            open_store(url).read_rows(lost.removesuffix("/0").removesuffix("/c"), 0, 1)
+
+
+def test_without_the_right_to_list_what_was_never_written_is_denied(
+    url, undisturbed, change_client
+):
+    put(undisturbed[1], url)
+    denied = raising(
+        PermissionError("Denied"), S3FileSystem._cat_file, lambda path, _: gone in path
+    )
+    gone = "asset/category/c/0"
+    change_client("_cat_file", denied)
+    assert open_store(url).column("category").tolist() == [""] * 3
+
+
+def test_a_version_that_is_gone_has_to_be_opened_again(s3, url, undisturbed):
+    store = open_store(put(undisturbed[1], url))
+    store.read(0)
+    s3.rm(str(store.path), recursive=True)
+    with pytest.raises(StoreError, match=r"c/0.* is missing \(was the store replaced\? Open it"):
+        store.read(0)
+
+
+@pytest.mark.parametrize("obstore", ["yes", "no"])
+def test_a_bucket_or_server_that_is_not_there_is_told(bucket, server, monkeypatch, obstore):
+    monkeypatch.setenv("SLATPREP_OBSTORE", obstore)
+    for url, told in (
+        ("s3://no-such/x", "^s3://no-such/x is not a slatprep store: its bucket does not exist;"),
+        (f"s3://{bucket}/x", f"store: s3://{bucket}/x/zarr.json does not exist;"),
+        (f"{server}/{bucket}/x", f"store: {server}/{bucket}/x/zarr.json does not exist;"),
+        ("http://127.0.0.1:1/x", "^http://127.0.0.1:1/x: cannot be reached .*connect"),
+    ):
+        with pytest.raises(StoreError, match=told):
+            open_store(url)
 
 
 @pytest.mark.parametrize("text", [
@@ -285,6 +347,31 @@ def test_records_nobody_can_ask_for_end_a_command_in_words(url, another, change_
     assert not (tmp_path / "s.zarr").exists()
 
 
+def test_a_command_names_the_url_that_was_given(url, undisturbed, tmp_path):
+    put(undisturbed[1], url)
+    assert document("verify", url)["store"] == url
+    told = refused("publish", url, "--out", tmp_path / "hub")
+    assert f"is on no local disk; `slatprep subset {url}/versions/" in told
+
+
+def test_an_upload_that_fails_ends_in_one_error(url, undisturbed, change_client, recwarn):
+    async def denied(*given: Any, **options: Any) -> None:
+        raise PermissionError("Access Denied")
+
+    change_client("_put_file", denied)
+    with pytest.raises(StoreError, match=r"cannot be written to .*Access Denied"):
+        put(undisturbed[1], url)
+    gc.collect()
+    assert not [one for one in recwarn if "never awaited" in str(one.message)]
+
+
+def test_errors_measured_where_nothing_may_be_written_are_told(url, undisturbed, change_client):
+    put(undisturbed[1], url)
+    change_client("_put_file", raising(PermissionError("Access Denied")))
+    with pytest.warns(UserWarning, match=r"decoys.json: .* could not be kept \(Access Denied\)"):
+        assert measure_errors(open_store(url), decoys=1).decoys
+
+
 def test_an_error_that_no_room_has_words_for_is_one_line(another, monkeypatch):
     def lost(*args: Any) -> None:
         raise OSError(errno.EIO, "connection lost", "s3://bucket/x")
@@ -334,7 +421,7 @@ def test_a_copy_is_made_once_and_no_name_leads_out(s3, url, undisturbed, request
     assert storage_of(undisturbed[1]).copied_version() == undisturbed[1]
 
 
-@pytest.mark.parametrize("how", ["removed", "cut", "emptied"])
+@pytest.mark.parametrize("how", ["removed", "cut", "emptied", "flipped", "a file", "[]", "{}"])
 def test_a_damaged_copy_is_made_again(url, undisturbed, how):
     put(undisturbed[1], url)
     copy = Path(str(open_store(url, copy=True).path))
@@ -342,12 +429,33 @@ def test_a_damaged_copy_is_made_again(url, undisturbed, how):
     if how == "emptied":
         shutil.rmtree(copy)
         copy.mkdir()
+    elif how == "a file":
+        shutil.rmtree(copy)
+        copy.write_text("")
     elif how == "cut":
         file.write_bytes(file.read_bytes()[:-1])
+    elif how == "flipped":
+        root = (copy / "zarr.json").read_bytes()
+        (copy / "zarr.json").write_bytes(root.replace(b"slatprep", b"slatpreq"))
     else:
         file.unlink()
+        if how in ("[]", "{}"):
+            copy.with_name(".demo.zarr.sizes").write_text(how)
     assert Path(str(open_store(url, copy=True).path)) == copy
     assert tree(copy) == tree(undisturbed[1])
+
+
+def test_a_damaged_shard_of_a_copy_says_what_to_remove(url, undisturbed, monkeypatch):
+    monkeypatch.setattr("slatprep.storage.cache.SMALL_BYTES", 0)
+    put(undisturbed[1], url)
+    copy = Path(str(open_store(url, copy=True).path))
+    shard = bytearray((copy / "voxel/feats/c/0/0").read_bytes())
+    shard[100] ^= 1
+    (copy / "voxel/feats/c/0/0").write_bytes(shard)
+    with pytest.raises(StoreError, match=f"damaged.* Remove {copy}, a copy, and open the store"):
+        open_store(url, copy=True).read(0)
+    shutil.rmtree(copy)
+    assert_same(open_store(url, copy=True), open_store(undisturbed[1]))
 
 
 def test_a_copy_that_differs_from_what_was_published_is_none(s3, url, undisturbed, tmp_path):
