@@ -26,6 +26,7 @@ from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import boundary, filled, occupancy_of
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.particles.fields import stored_field
+from slatprep.particles.motion import particles_of
 from slatprep.particles.read import read_particles
 from slatprep.particles.simulate import simulate_motion
 from slatprep.particles.transfer import transfer, write_transferred
@@ -216,10 +217,7 @@ def particles(
 
 def fill(coords: np.ndarray, count: int) -> np.ndarray:
     """Return a lattice of particles (N, 3) inside SLAT voxels, `count` along the unit cube."""
-    inside = filled(occupancy_of(coords))
-    lattice = (np.argwhere(np.ones((count,) * 3)) + 0.5) / count - 0.5
-    voxels = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
-    return lattice[inside[tuple(voxels.T)]]
+    return particles_of(filled(occupancy_of(coords)), count)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import difflib
 import errno
 import pkgutil
 import sys
+import warnings
 from typing import Any, NoReturn
 
 import click
@@ -65,6 +66,21 @@ def _loaded(name: str) -> click.Command:
     return command
 
 
+def _say_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: object = None,
+    line: str | None = None,
+) -> None:
+    """Print a warning; one for users has no line of code."""
+    text = str(message)
+    if not issubclass(category, UserWarning):
+        text = warnings.formatwarning(message, category, filename, lineno, line).strip()
+    say(f"slatprep: warning: {text}", err=True)
+
+
 class LazyGroup(click.Group):
     """A group that imports a command when it is used, and prints errors as one line."""
 
@@ -99,7 +115,9 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; print an expected error as one line and set the exit code."""
         try:
-            done = super().invoke(ctx)
+            with warnings.catch_warnings():
+                warnings.showwarning = _say_warning
+                done = super().invoke(ctx)
         except OutputLostError:
             self._fail_unprinted(ctx)
         except SlatprepError as error:

@@ -200,13 +200,16 @@ def publish(
     """
     from slatprep.export.croissant import Stated
     from slatprep.export.publish import publish_store
+    from slatprep.records import USABLE
 
     if verdicts is not None and data == "store":
         raise ConfigError(
             "--verdict is for --data webdataset; `slatprep subset` chooses of a store"
         )
     opened = options.opened(store)
-    drawn = {"assets.png": _picture(opened, pictures)} if pictures and len(opened) else {}
+    chosen = USABLE if verdicts is None and data == "webdataset" else verdicts or ()
+    rows = [row for row, kept in enumerate(opened.having(chosen)) if kept]
+    drawn = {"assets.png": _picture(opened, rows, pictures)} if pictures and rows else {}
     output.if_stopped = _HALF.format(out)
     with output.progress("publish") as progress:
         summary = publish_store(
@@ -226,13 +229,14 @@ def publish(
     output.note(f"next: hf upload OWNER/NAME {out} --repo-type dataset")
 
 
-def _picture(store: Store, count: int) -> bytes:
-    """Draw `count` assets from as many categories as possible."""
+def _picture(store: Store, rows: Sequence[int], count: int) -> bytes:
+    """Draw `count` assets of the rows, from as many categories as possible."""
     from slatprep.inspect.pictures.write import sheet_of
 
     seen: dict[str, int] = {}
     turns = []
-    for row, category in enumerate(map(str, store.column("category"))):
+    for row in rows:
+        category = str(store.column("category")[row])
         seen[category] = seen.get(category, 0) + 1
         turns.append((seen[category], row))
     return sheet_of(store, [store.ids[row] for _, row in sorted(turns)[:count]])

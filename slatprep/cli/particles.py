@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -40,6 +39,7 @@ class MaterialOptions:
 
     def field(self, output: Output, points: Points) -> VoxelField:
         """Return the materials of the stored asset or of the prediction that is given."""
+        from slatprep.export.formats import clipped_values
         from slatprep.normalize import PIXIE_RANGES
         from slatprep.particles.fields import predicted_field, stored_field
         from slatprep.readers.ranges import read_ranges
@@ -54,6 +54,8 @@ class MaterialOptions:
                 )
             opened = options.opened(store)
             options.note_numbered(output, opened, [self.asset])
+            for remark in clipped_values(opened, [opened.ids[opened.match(self.asset)]], points):
+                output.note(remark)
             return stored_field(opened, self.asset, points)
         if points != "slat" or (store is not None and ranges is not None):
             raise ConfigError(
@@ -165,7 +167,7 @@ class MotionOptions:
 
     size: options.Above0 = 0.4
     height: Annotated[float, options.FiniteRange(min=0)] = 0.1
-    wind: float = 0.0
+    wind: Annotated[float, options.FiniteRange()] = 0.0
     seconds: options.Above0 = 0.6
     rate: options.Positive = 30
     substeps: options.Positive = 4
@@ -209,7 +211,8 @@ def simulate(
     out
         Folder of the frames, frame-0000.ply and so on.
     picture : FILE
-        Also draw the frames: an animation (gif, webp) or a strip of five (png).
+        Also draw the frames: an animation (gif, webp) or a strip of five (png). An existing file
+        is replaced.
     axes
         Axes of the Gaussians. [default: the axes that fit]
     stretch
@@ -241,14 +244,13 @@ def simulate(
     )
     for note in scene.notes:
         output.note(note)
+    work.require_writable(Path(out), *([picture.absolute().parent] if picture else ()))
     begin = time.perf_counter()
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always", UserWarning)
-        moved = work.run(scene, **vars(motion))
-    for warning in told:
-        output.note(str(warning.message))
-    computed = time.perf_counter() - begin
     with output.progress("simulate") as progress:
+        moved = work.run(scene, **vars(motion), progress=progress)
+    computed = time.perf_counter() - begin
+    output.if_stopped = f"{out} holds frames of the old run, the new one, or both; run it again"
+    with output.progress("write") as progress:
         count = work.write_frames(
             Path(out), scene, moved, motion.rate, picture, stretch, progress=progress
         )

@@ -15,7 +15,14 @@ from typing import Any
 
 from slatprep.errors import require_one_of
 from slatprep.export import target
-from slatprep.export.formats import Exported, ExportOptions, Writer, choose_ids, describe_columns
+from slatprep.export.formats import (
+    Exported,
+    ExportOptions,
+    Writer,
+    choose_ids,
+    clipped_values,
+    describe_columns,
+)
 from slatprep.records import USABLE, Place, words_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_outside
@@ -118,6 +125,7 @@ def export_store(
     tell = progress or (lambda done, total: None)
     writer: Writer = resolve_name(FORMATS[format])(opened, ids, options)
     about = _about(opened, format)
+    clipped = clipped_values(opened, ids, options.points or ("grid" if format == "usd" else "slat"))
     entries: list[_Entry] = []
     if writer.is_export is not None:
         with target.file(out, writer.is_export) as file:
@@ -136,7 +144,7 @@ def export_store(
                 entries += part
                 tell(len(entries), len(ids))
             entries.sort(key=lambda entry: str(entry["asset_id"]))
-            about |= {"notes": writer.remarks(entries)}
+            about |= {"notes": [*clipped, *writer.remarks(entries)]}
             if writer.finish is not None:
                 about |= {"files": writer.finish(directory, entries)}
             target.write_index(directory, about, entries)
@@ -149,7 +157,7 @@ def export_store(
         files=len(sizes),
         size=sum(sizes),
         seconds=time.perf_counter() - begin,
-        notes=writer.remarks(entries),
+        notes=(*clipped, *writer.remarks(entries)),
     )
 
 

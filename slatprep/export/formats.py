@@ -96,6 +96,17 @@ def require_solver_classes(store: Store) -> None:
         )
 
 
+def clipped_values(store: Store, ids: Iterable[str], points: Points) -> tuple[str, ...]:
+    """Return a remark if the build set values of these assets to the ends of the store's ranges."""
+    column = store.column("clipped_grid" if points == "grid" else "clipped")
+    counts = column[[store.find(one) for one in ids]].sum(axis=0).tolist()
+    named = zip(counts, store.about.property_columns, strict=True)
+    if not (clipped := [f"{count:,} of {name}" for count, name in named if count]):
+        return ()
+    beyond = "values beyond the store's ranges are taken as the end of the range"
+    return (f"{beyond}: {', '.join(clipped)}",)
+
+
 def annotated_points(asset: StoredAsset, points: Points) -> AnnotatedPoints:
     """Return the valid SLAT voxels, or the annotated voxels of the field at distance 0."""
     if points == "grid":

@@ -208,8 +208,12 @@ def write_picture(path: Path, frames: Sequence[NDArray[np.uint8]], rate: int) ->
             strip = np.concatenate([frames[number] for number in some], axis=1)
             Image.fromarray(strip).quantize(64).save(new, form, optimize=True)
             return
-        shown = round(1000 / rate)
-        pictures = [Image.fromarray(frame).quantize(64) for frame in frames]
+        # GIF has hundredths of a second, and programs show no frame for less than two.
+        tick, least = (10, 2) if form.lower() == "gif" else (1, 1)
+        step = -(-least * tick * rate // 1000)
+        ends = [round(1000 / tick * number / rate) * tick for number in range(0, len(frames), step)]
+        shown = np.diff([*ends, round(1000 / tick * len(frames) / rate) * tick]).tolist()
+        pictures = [Image.fromarray(frame).quantize(64) for frame in frames[::step]]
         pictures[0].save(
             new, form, save_all=True, append_images=pictures[1:], duration=shown, loop=0
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from slatprep.particles.fields import VoxelField
 from slatprep.particles.read import FRAMES, Axes, Particles, read_particles
 from slatprep.particles.transfer import doubt_axes, recognise_axes, transfer
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, Place
-from slatprep.storage.atomic import staged
+from slatprep.storage.atomic import staged, writing
 from slatprep.store import open_store
 
 CLASSES = MATERIAL_CLASSES[:BACKGROUND]
@@ -66,9 +67,13 @@ def prepare(
     Young's modulus [Pa] and density [kg/m^3] are for the whole object; None keeps the field's.
     """
     solid = filled(occupancy_of(field.cells if cells is None else cells))
-    lattice = (np.indices((count,) * 3).reshape(3, -1).T + 0.5) / count - 0.5
-    inside = np.floor((lattice + 0.5) * RESOLUTION).astype(int)
-    positions = lattice[solid[tuple(inside.T)]]
+    positions = particles_of(solid, count)
+    size, notes = (len(positions) / count**3) / solid.mean(), []
+    if len(positions) and abs(size - 1.0) > 0.02:
+        notes.append(
+            f"the particles fill {size:.3g} times the object's volume, and weigh as much more; "
+            f"--particles {RESOLUTION} fills it exactly"
+        )
     given = transfer(positions, field, far="nearest")
     classes, properties = given.material.copy(), given.properties.copy()
     if material is not None:
@@ -78,16 +83,30 @@ def prepare(
             properties[:, column] = value
     own = positions, 1 / count, classes, properties
     if gaussians is None:
-        return Scene(
-            *own, splats.gaussians_of(positions, classes, 1 / count), positions, "slat", ()
-        )
+        made = splats.gaussians_of(positions, classes, 1 / count)
+        return Scene(*own, made, positions, "slat", tuple(notes))
     surface = field
     if cells is not None:
         nothing = np.zeros(len(cells), np.uint8), np.ones((len(cells), 3), np.float32)
         surface = VoxelField(cells, *nothing)
-    read, notes = _read(gaussians, axes, field, surface)
+    read, told = _read(gaussians, axes, field, surface)
     vertices = splats.require_gaussians(read.vertices, gaussians)
-    return Scene(*own, vertices, read.in_slat(), read.axes, notes)
+    return Scene(*own, vertices, read.in_slat(), read.axes, (*notes, *told))
+
+
+def particles_of(solid: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
+    """Return centres (N, 3), in the unit cube, of the cubes of a lattice that a solid fills.
+
+    The solid (64, 64, 64) must fill at least half of a cube. The lattice has `count` to a side.
+    """
+    voxels = np.arange(RESOLUTION, dtype=np.float32)
+    starts = voxels.dtype.type(RESOLUTION / count) * np.arange(count)[:, None]
+    ends = np.minimum(starts + RESOLUTION / count, voxels + 1)
+    part = np.maximum(ends - np.maximum(starts, voxels), 0) * count / RESOLUTION
+    shares = solid.astype(np.float32)
+    for _ in range(3):  # Each product turns the axes on.
+        shares = np.tensordot(shares, part.astype(np.float32), (0, 1))
+    return (np.argwhere(shares > 0.5 - 1e-6) + 0.5) / count - 0.5
 
 
 def _read(
@@ -104,13 +123,13 @@ def _read(
 
 
 def run(
-    scene: Scene, *, size: float, height: float, wind: float, device: str | None, **times: Any
+    scene: Scene, *, size: float, height: float, wind: float, device: str | None, **options: Any
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Simulate the particles; return positions (F, N, 3) in the SLAT frame, and gradients.
 
     The unit cube is `size` [m] wide. The object falls from `height` [m], or stands in the `wind`
-    [m/s] along x without gravity. `times` are seconds, rate and substeps of `simulate_motion`. The
-    default `device` is the GPU if there is one.
+    [m/s] along x without gravity. The default `device` is the GPU if there is one. `options` are
+    others of `simulate_motion`.
     """
     from slatprep.particles.simulate import preferred_device, simulate_motion
 
@@ -127,7 +146,7 @@ def run(
         wind=(wind, 0.0, 0.0),
         fixed=(foot | np.isin(scene.material, _HELD)) if windy else None,
         device=device or preferred_device(),
-        **times,
+        **options,
     )
     # In the first frame the object lies where the SLAT has it.
     shift = moved.positions[0] - scene.positions * size
@@ -145,6 +164,14 @@ def old_frames(out: Path) -> list[Path]:
     return named
 
 
+def require_writable(*folders: Path) -> None:
+    """Make the folders, and raise StoreError if no file can be written to one of them."""
+    for folder in folders:
+        with writing(str(folder), folder.parent):
+            folder.mkdir(parents=True, exist_ok=True)
+            TemporaryFile(dir=folder).close()
+
+
 def write_frames(
     out: Path,
     scene: Scene,
@@ -156,11 +183,10 @@ def write_frames(
 ) -> int:
     """Write ``frame-0000.ply`` and so on, and the picture; return the number of frames.
 
-    The `old_frames` in `out` are removed.
+    Of the `old_frames` in `out` those are removed in the end that this run does not have.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for old in old_frames(out):  # There may be more than this run has.
-        old.unlink()
+    left = set(old_frames(out))
     carrier = splats.bind(scene.places, scene.positions, scene.spacing)
     low = moved[0].min(axis=(0, 1)) - scene.spacing
     high = moved[0].max(axis=(0, 1)) + scene.spacing
@@ -169,11 +195,15 @@ def write_frames(
     for number, (positions, gradients) in enumerate(zip(*moved, strict=True)):
         places, local = splats.carry(carrier, positions, gradients)
         rows = splats.deform(scene.vertices, places, local, scene.axes, stretch=stretch)
-        with staged(out / f"frame-{number:04d}.ply") as path:
+        file = out / f"frame-{number:04d}.ply"
+        with staged(file) as path:
             splats.write_gaussians(path, rows, FRAMES[scene.axes])
+        left.discard(file)
         if picture is not None:
             pictures.append(splats.draw(rows, places, low, high))
         progress(number + 1, frames)
     if picture is not None:
         splats.write_picture(picture, pictures, rate)
+    for file in left:
+        file.unlink()
     return frames

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from slatprep.errors import SlatprepError, needing
 from slatprep.records import MATERIAL_CLASSES
 from slatprep.records.yielding import MAX_POISSON, YIELDING
+from slatprep.workers import Progress
 
 AIR, DRAG = 1.2, 1.0
 """Density of air [kg/m^3], and the drag coefficient of a face."""
@@ -23,6 +24,16 @@ AIR, DRAG = 1.2, 1.0
 _LIMITS = ("friction", "yield_pressure", "tensile_yield_ratio", "yield_stress", "hardening",
            "dilatancy", "viscosity")  # fmt: skip
 """The engine's arrays for the fields of `Yielding`."""
+
+
+_BOUNDS = (("E", "Pa", 1e-3, 1e15), ("density", "kg/m^3", 1e-3, 1e6), ("nu", "", -0.999, 0.5))
+"""Name, unit, least and largest value of each property; beyond, the engine's float32 fail."""
+
+_LENGTHS = 1e-6, 1e4
+"""Smallest spacing and largest distance [m] that the engine takes."""
+
+MOST_WIND, MOST_FRAMES = 1e3, 10_000
+"""Largest speed of the wind [m/s], and number of frames."""
 
 
 class Motion(NamedTuple):
@@ -49,6 +60,7 @@ def simulate_motion(
     rate: int = 60,
     substeps: int = 2,
     device: str = "cpu",
+    progress: Progress | None = None,
 ) -> Motion:
     """Simulate an object that falls to the ground from rest, in still air or in the wind.
 
@@ -60,15 +72,23 @@ def simulate_motion(
     ``AIR * DRAG / 2`` times the square of the velocity relative to the particle on each free
     face that meets it; parts do not shelter each other. Particles of `fixed` (N,) do not move.
     Each of `rate` frames a second has `substeps` time steps; the first frame is the start. The
-    cells of the engine's grid are two spacings wide. SlatprepError if the engine is not
-    installed, or a particle cannot be simulated.
+    cells of the engine's grid are two spacings wide. `progress` is called with the number of
+    frames done and of all. SlatprepError if the engine or the device is missing, or something
+    cannot be simulated.
     """
     rest, stuff = np.array(positions, dtype=np.float64), np.asarray(properties, dtype=np.float64)
     _check(rest, np.asarray(material), stuff)
+    air, count = np.asarray(wind, dtype=np.float64), seconds * rate
+    _check_scene(rest, spacing, height, air, count)
     if clipped := int(np.count_nonzero(stuff[:, 2] > MAX_POISSON)):
         warnings.warn(f"nu of {clipped:,} particles is taken as {MAX_POISSON}", stacklevel=3)
         stuff = np.minimum(stuff, [np.inf, np.inf, MAX_POISSON])
     newton, warp = _engine()
+    try:
+        warp.get_device(device)
+    except ValueError:
+        there = ", ".join(map(str, warp.get_devices()))
+        raise SlatprepError(f"{device!r} is no device here; expected {there}") from None
     rest[:, 2] += height + spacing / 2 - rest[:, 2].min()
     modulus, density, ratio = stuff.T
     held = np.zeros(len(rest), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
@@ -99,10 +119,9 @@ def simulate_motion(
         ),
     )
     now, after = model.state(), model.state()
-    air = np.asarray(wind, dtype=np.float64)
     area = windward(rest, air, spacing)
     frames, gradients = [rest], [np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))]
-    for _ in range(round(seconds * rate)):
+    for done in range(round(count)):
         for _ in range(substeps):
             if area.any():
                 past = air - now.particle_qd.numpy()
@@ -114,6 +133,8 @@ def simulate_motion(
             now, after = after, now
         frames.append(now.particle_q.numpy().astype(np.float64))
         gradients.append(now.mpm.particle_transform.numpy().copy())
+        if progress:
+            progress(done + 1, round(count))
     moved = np.stack(frames)
     way = np.linalg.norm(np.diff(moved, axis=0), axis=2).max(initial=0.0)
     if (crossed := way / (2 * spacing)) > substeps:
@@ -157,13 +178,35 @@ def _check(
             f"material {others[0]} ({name}) is not simulated; expected "
             f"{', '.join(f'{index} ({MATERIAL_CLASSES[index]})' for index in sorted(YIELDING))}"
         )
-    modulus, density, ratio = properties.T
-    wrong = ~((modulus > 0) & (density > 0) & (ratio > -1) & (ratio <= 0.5))
-    if wrong.any():
-        row = int(np.argmax(wrong))
+    for values, (name, unit, least, most) in zip(properties.T, _BOUNDS, strict=True):
+        wrong = ~((values >= least) & (values <= most))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise SlatprepError(
+                f"particle {row} has {name} = {values[row]:g} {unit}".rstrip()
+                + f"; expected {least:g} to {most:g}"
+            )
+
+
+def _check_scene(
+    positions: NDArray[np.float64],
+    spacing: float,
+    height: float,
+    wind: NDArray[np.float64],
+    frames: float,
+) -> None:
+    least, most = _LENGTHS
+    widest = max(height, float(np.ptp(positions, axis=0).max()))
+    if not (least <= spacing and 0 <= widest <= most):
         raise SlatprepError(
-            f"particle {row} has E = {modulus[row]:g} Pa, density = {density[row]:g} kg/m^3, "
-            f"nu = {ratio[row]:g}; expected E and density above 0, nu above -1 and at most 0.5"
+            f"particles {spacing:g} m apart, over {widest:g} m, cannot be simulated; expected at "
+            f"least {least:g} m, and at most {most:g} m"
+        )
+    if not (np.abs(wind) <= MOST_WIND).all():
+        raise SlatprepError(f"a wind of {wind} m/s is no wind; expected at most {MOST_WIND:g} m/s")
+    if not 1 <= round(frames) <= MOST_FRAMES:
+        raise SlatprepError(
+            f"seconds times rate is {frames:g}; expected 1 to {MOST_FRAMES:,} frames"
         )
 
 

@@ -21,7 +21,7 @@ from slatprep.errors import ConfigError, SlatprepError
 from slatprep.particles import gaussians, motion
 from slatprep.particles.fields import VoxelField
 from slatprep.particles.read import SAVED_AXES
-from slatprep.particles.simulate import AIR, simulate_motion, windward
+from slatprep.particles.simulate import AIR, Motion, simulate_motion, windward
 from slatprep.store import open_store
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
@@ -34,6 +34,12 @@ SPACING = 0.1
 CUBE = np.argwhere(np.ones((4, 4, 4))) * SPACING
 ONE_PART = np.zeros(len(CUBE), dtype=int)
 STUFF = np.tile([1e5, 1e3, 0.3], (len(CUBE), 1))
+
+# `make simulate` runs these with the real engine, as a job of continuous integration does.
+needs_newton = pytest.mark.skipif(
+    importlib.util.find_spec("newton") is None,
+    reason="needs the extra `simulate`: 0.5 GB, and minutes to compile; see make simulate",
+)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -83,7 +89,9 @@ def test_a_ratio_of_one_half_is_taken_and_told(monkeypatch):
 
 @pytest.mark.parametrize(("material", "change", "said"), [
     (7, None, r"material 7 \(background\) is not simulated"),
-    (0, (3, 1, 0.0), "particle 3 has E = 100000 Pa, density = 0"),
+    (0, (3, 1, 0.0), r"particle 3 has density = 0 kg/m\^3; expected 0.001 to 1e\+06"),
+    (0, (3, 1, 1e-30), "particle 3 has density = 1e-30"),
+    (0, (4, 0, 1e300), r"particle 4 has E = 1e\+300 Pa; expected 0.001 to 1e\+15"),
     (0, (5, 2, 0.51), "nu = 0.51; expected"),
     (0, (2, 0, np.nan), "particle 2 has E = nan"),
 ])  # fmt: skip
@@ -93,6 +101,27 @@ def test_particles_that_cannot_be_simulated_are_named(material, change, said):
         stuff[change[0], change[1]] = change[2]
     with pytest.raises(SlatprepError, match=said):
         simulate_motion(CUBE, ONE_PART + material, stuff, SPACING)
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"spacing": 1e-20}, "particles 1e-20 m apart, over .* at least 1e-06 m"),
+    ({"spacing": np.nan}, "particles nan m apart"),
+    ({"height": 1e30}, r"over 1e\+30 m, cannot be simulated"),
+    ({"wind": (0, 0, 1e300)}, "expected at most 1000 m/s"),
+    ({"wind": (np.nan, 0, 0)}, "expected at most 1000 m/s"),
+    ({"seconds": 0.001}, "seconds times rate is 0.06; expected 1 to 10,000 frames"),
+    ({"seconds": 1e6}, "expected 1 to 10,000 frames"),
+])  # fmt: skip
+def test_what_the_engine_s_numbers_cannot_hold_is_refused(given, said):
+    spacing = given.pop("spacing", SPACING)
+    with pytest.raises(SlatprepError, match=said):
+        simulate_motion(CUBE, ONE_PART, STUFF, spacing, **given)
+
+
+@needs_newton
+def test_a_device_that_is_not_there_is_named():
+    with pytest.raises(SlatprepError, match="'foo' is no device here; expected cpu"):
+        simulate_motion(CUBE, ONE_PART, STUFF, SPACING, device="foo")
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -105,13 +134,6 @@ def test_the_wind_meets_the_shadow_of_what_is_convex(seed):
     shadow = across @ [size[1] * size[2], size[0] * size[2], size[0] * size[1]] * SPACING**2
     np.testing.assert_allclose(windward(box, way, SPACING).sum(), shadow)
     assert not windward(box, np.zeros(3), SPACING).any()
-
-
-# `make simulate` runs these with the real engine, as a job of continuous integration does.
-needs_newton = pytest.mark.skipif(
-    importlib.util.find_spec("newton") is None,
-    reason="needs the extra `simulate`: 0.5 GB, and minutes to compile; see make simulate",
-)
 
 
 @needs_newton
@@ -278,10 +300,28 @@ def test_the_nearest_gaussian_is_drawn_in_its_colour(tmp_path):
     seen = {tuple(colour) for colour in picture.reshape(-1, 3)}
     front = tuple((gaussians.colours_of(rows)[0] * 255).astype(np.uint8))
     assert front in seen and len(seen) == 3  # paper, the front one, the shaded one behind
-    for suffix in ("png", "gif"):
-        gaussians.write_picture(tmp_path / f"new/a.{suffix}", [picture, picture[::-1].copy()], 20)
-    with Image.open(tmp_path / "new/a.gif") as animation:
-        assert animation.n_frames == 2
+    gaussians.write_picture(tmp_path / "new/a.png", [picture, picture[::-1].copy()], 20)
+    with Image.open(tmp_path / "new/a.png") as strip:
+        assert strip.size == (2 * picture.shape[1], picture.shape[0])
+
+
+@pytest.mark.parametrize(("suffix", "rate", "shown"), [
+    ("gif", 20, 1), ("gif", 30, 1), ("gif", 50, 1), ("gif", 60, 2), ("gif", 200, 4),
+    ("webp", 30, 1), ("webp", 200, 1),
+])  # fmt: skip
+def test_an_animation_takes_as_long_as_the_motion(suffix, rate, shown, tmp_path):
+    """A GIF shows no frame for less than two hundredths of a second, as programs slow those."""
+    frames = list(np.random.default_rng(0).integers(0, 256, (60, 24, 24, 3), dtype=np.uint8))
+    gaussians.write_picture(tmp_path / f"a.{suffix}", frames, rate)
+    with Image.open(tmp_path / f"a.{suffix}") as animation:
+        assert animation.n_frames == len(frames) // shown
+        lasts = []
+        for number in range(animation.n_frames):
+            animation.seek(number)
+            animation.load()
+            lasts.append(animation.info["duration"])
+    assert sum(lasts) == pytest.approx(1000 * len(frames) / rate, abs=5)
+    assert max(lasts) - min(lasts) <= 10
 
 
 def test_a_picture_that_fails_leaves_the_older_one(tmp_path):
@@ -333,6 +373,87 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path):
     with pytest.raises(ConfigError, match=r"frame-2024\.ply is no frame of slatprep"):
         motion.write_frames(out, scene, (moved, gradients), 30, None, False, lambda *_: None)
     assert sorted(path.name for path in out.iterdir()) == [*names, "frame-2024.ply"]
+
+
+def test_a_run_that_is_stopped_keeps_the_frames_it_has_not_replaced(tmp_path):
+    coords = write_prediction(tmp_path / "p.npz")
+    stuff = np.tile(np.float32(JELLY[1:]), (len(coords), 1))
+    field = VoxelField(coords.astype(np.uint8), np.zeros(len(coords), np.uint8), stuff)
+    scene, out = motion.prepare(field, None, None, None, 8), tmp_path / "frames"
+
+    def stop(done: int, total: int) -> None:
+        if (done, total) == (1, 2):
+            raise KeyboardInterrupt
+
+    def write(count: int) -> None:
+        moved = np.repeat(scene.positions[None], count, axis=0)
+        gradients = np.tile(np.eye(3, dtype=np.float32), (*moved.shape[:2], 1, 1))
+        motion.write_frames(out, scene, (moved, gradients), 30, None, False, stop)
+
+    write(4)
+    with pytest.raises(KeyboardInterrupt):
+        write(2)
+    assert len(list(out.iterdir())) == 4
+
+
+LONE = np.zeros((64, 64, 64), dtype=bool)
+LONE[32, 32, 32] = True
+
+
+@pytest.mark.parametrize("start", [20, 21])
+@pytest.mark.parametrize(("thick", "layers"), [(1, 1), (2, None), (3, 2), (4, None)])
+def test_thin_parts_have_the_same_particles_wherever_they_lie(start, thick, layers):
+    """A layer of particles stands for two of voxels, or for the one that it has."""
+    solid = np.zeros((64, 64, 64), dtype=bool)
+    solid[10:30, 10:30, start : start + thick] = True
+    if layers is None:  # Between two layers of particles, half of each is filled.
+        layers = thick // 2 + start % 2
+    places = motion.particles_of(solid, 32)
+    assert len(places) == 100 * layers
+    np.testing.assert_allclose(places[:, :2].mean(axis=0), 20 / 64 - 0.5)
+    assert not len(motion.particles_of(LONE, 32))
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([28, 32, 48, 64, 100, 128]))
+def test_particles_lie_as_the_solid_does(seed, count):
+    rng = np.random.default_rng(seed)
+    axes, middle = rng.uniform(8, 20, 3), rng.uniform(24, 40, 3)
+    cells = np.stack(np.indices((64, 64, 64)), axis=-1)
+    solid = (((cells - middle) / axes) ** 2).sum(axis=-1) < 1
+    places = motion.particles_of(solid, count)
+    edge = 64 / count
+    inside = (np.argwhere(solid) + 0.5) / 64 - 0.5
+    assert 64 * np.abs(places.mean(axis=0) - inside.mean(axis=0)).max() < 0.15 * max(edge, 1)
+    if count % 64 == 0:  # Each voxel has its own.
+        assert len(places) == solid.sum() * (count // 64) ** 3
+    else:
+        assert len(places) * edge**3 == pytest.approx(solid.sum(), rel=0.05 * edge)
+
+
+def test_what_is_given_for_the_whole_object_is_taken(tmp_path, monkeypatch):
+    coords = write_prediction(tmp_path / "p.npz").astype(np.uint8)
+    stuff = np.tile(np.float32(JELLY[1:]), (len(coords), 1))
+    field = VoxelField(coords, np.zeros(len(coords), np.uint8), stuff)
+    scene = motion.prepare(field, None, None, None, 32, material="metal", young=7e6, density=9e2)
+    assert set(scene.material.tolist()) == {METAL[0]}
+    expected = [7e6, 9e2, JELLY[3]]
+    np.testing.assert_allclose(scene.properties, np.tile(expected, (len(scene.positions), 1)))
+    (told,) = motion.prepare(field, None, None, None, 10).notes
+    volume = len(motion.prepare(field, None, None, None, 64).positions) / 64**3
+    share = len(motion.prepare(field, None, None, None, 10).positions) / 10**3 / volume
+    assert told.startswith(f"the particles fill {share:.3g} times the object's volume")
+
+    def still(places: np.ndarray, *_: object, fixed: np.ndarray, **options: object) -> Motion:
+        held.append((fixed, options))
+        return Motion(places[None], np.eye(3, dtype=np.float32))
+
+    held: list[tuple[np.ndarray, dict[str, object]]] = []
+    monkeypatch.setattr("slatprep.particles.simulate.simulate_motion", still)
+    motion.run(scene, size=0.5, height=0.3, wind=4.0, device="cpu", seconds=1)
+    ((fixed, options),) = held
+    heights = scene.positions[:, 2]
+    np.testing.assert_array_equal(fixed, heights < heights.min() + 1.1 / 32)  # the lowest layers
+    assert (options["height"], options["gravity"], options["wind"]) == (0.0, 0.0, (4.0, 0.0, 0.0))
 
 
 def test_an_object_without_a_particle_is_told_in_words():

@@ -183,7 +183,7 @@ def page_content(
         },
         "errors": _errors(store),
         "turns": quarter_turns(),
-        "properties": _properties(store, tallies, clipped=built is not None),
+        "properties": _properties(store, tallies),
         "balance": _balance(store, tallies),
         "assets": _table(store, built.failed if built else (), told, listed, drawn),
         "shared": list(shared_sources(store, "SLAT", slat_contents(store))),
@@ -213,8 +213,11 @@ def _errors(store: Store) -> dict[str, Any]:
     }
 
 
-def _properties(store: Store, tallies: Mapping[str, Tally], clipped: bool) -> list[dict[str, Any]]:
-    """Return the histograms of each property by class, and its ranges."""
+def _properties(store: Store, tallies: Mapping[str, Tally]) -> list[dict[str, Any]]:
+    """Return the histograms of each property by class, its ranges, and numbers of clipped values.
+
+    The numbers are those of the field and of the SLAT.
+    """
     normalization, published = store.normalization, {one.name: one for one in PIXIE_RANGES.ranges}
     total = sum(tallies.values(), start=no_tally(store, BINS)).histogram.astype(np.int64)
     return [
@@ -226,13 +229,14 @@ def _properties(store: Store, tallies: Mapping[str, Tally], clipped: bool) -> li
             "pixie": [pixie.lo, pixie.hi] if (pixie := published.get(span.name)) else None,
             "field": field.tolist(),
             "slat": slat.tolist(),
-            "clipped": int(count) if clipped else None,
+            "clipped": clipped,
         }
-        for span, one, field, slat, count in zip(
+        for span, one, field, slat, *clipped in zip(
             normalization.ranges,
             store.contents.properties,
             *total,
-            store.column("clipped").sum(axis=0),
+            store.column("clipped_grid").sum(axis=0).tolist(),
+            store.column("clipped").sum(axis=0).tolist(),
             strict=True,
         )
     ]

@@ -163,7 +163,7 @@ const Sections = (() => {
     const source = CONTENT.properties[0].source;
     const range = { dataset: "the smallest and largest value of the dataset that was built", pixie: "Pixie's published ranges" }[source] ?? (/^(p\d|dataset of)/.test(source) ? source : `the file ${source}`);
     byId("properties-hint").textContent =
-      `Before: the annotated voxels of the PixieVerse fields in physical units, not normalised. After: the valid SLAT voxels as the store holds them. ` +
+      `Before: the annotated voxels of the PixieVerse fields in physical units, clipped to the range, not normalised. After: the valid SLAT voxels as the store holds them. ` +
       `Solid lines mark the range that becomes −1 to 1 (${range}); dashed lines, Pixie's published range.`;
     byId("property-charts").replaceChildren(...CONTENT.properties.flatMap((property) => [before(property), after(property)]));
   }
@@ -177,6 +177,8 @@ const Sections = (() => {
     const say = (k) => `${Format.share(totals[k] / all)} of the voxels, most often ${largest(k)}`;
     return { parts, all, say };
   }
+
+  const clipped = (count) => (count ? `${Format.count(count)} of them clipped` : "none clipped");
 
   function before(property) {
     const { name, unit } = PROPERTY_NAMES[property.name];
@@ -197,7 +199,7 @@ const Sections = (() => {
     }
     return Charts.histogram({
       title: `${name}${unit && ` [${unit}]`}, before`,
-      sub: `${Format.count(all)} voxels, range ${text(property.lo)} to ${text(property.hi)}${unit && ` ${unit}`}`,
+      sub: `${Format.count(all)} voxels${property.clipped[0] ? `, ${clipped(property.clipped[0])}` : ""}, range ${text(property.lo)} to ${text(property.hi)}${unit && ` ${unit}`}`,
       edges, bins: parts, domain, ticks,
       marks: [
         { at: property.lo, text: text(property.lo), own: true },
@@ -212,10 +214,9 @@ const Sections = (() => {
     const { name } = PROPERTY_NAMES[property.name];
     const { parts, all, say } = spread(property, property.slat);
     const edges = Array.from({ length: parts.length + 1 }, (_, k) => -1 + (2 * k) / parts.length);
-    const clipped = property.clipped === null ? "" : property.clipped ? `, ${Format.count(property.clipped)} of them clipped` : ", none clipped";
     return Charts.histogram({
       title: `${name}, after`,
-      sub: `${Format.count(all)} voxels${clipped}`,
+      sub: `${Format.count(all)} voxels, ${clipped(property.clipped[1])}`,
       edges, bins: parts, domain: [-1.04, 1.04],
       ticks: [-1, -0.5, 0, 0.5, 1].map((at) => ({ at, text: String(at).replace("-", "−") })),
       marks: [{ at: -1, text: "−1", own: true }, { at: 1, text: "1", own: true }],
