@@ -332,10 +332,9 @@ def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(tmp_path, monkeyp
         assert run.parameters.keys() == {"seed", "splits"}
 
 
-@pytest.mark.parametrize(
-    ("flags", "precision"),
-    [("avx2 avx512f", "fp32"), ("avx512f avx512_bf16", "bf16"), ("amx_bf16", "bf16")],
-)
+@pytest.mark.parametrize(("flags", "precision"), [
+    ("avx2 avx512f", "fp32"), ("avx512f avx512_bf16", "bf16"), ("amx_bf16", "bf16"),
+])  # fmt: skip
 def test_precision_is_that_of_the_processor(flags, precision, monkeypatch):
     text = f"processor : 0\nmodel name : any\nflags : fpu {flags}\n"
     monkeypatch.setattr(Path, "read_text", lambda path, **_: text)
