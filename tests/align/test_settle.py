@@ -151,9 +151,7 @@ def test_whichever_placement_came_first_the_same_one_is_chosen(boxed):
 @pytest.mark.parametrize("gain", [-0.1, -0.02, 0.0, 0.03])
 @pytest.mark.parametrize(("score", "sharper"), [(0.3, 1), (0.9, 2), (0.999, 10), (np.nan, 1)])
 @pytest.mark.parametrize(("agree", "others"), [(5, 5), (19, 1), (400, 0)])
-def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
-    agree, others, score, sharper, gain
-):
+def test_odds_of_shapes_are_weighed_by_those_of_the_dataset(agree, others, score, sharper, gain):
     """By Bayes' rule: one more asset has any of the 23 other rotations, beside those counted."""
     consensus = _agreeing(agree, others)
     for number in (0, 22):
@@ -164,10 +162,9 @@ def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
         assert probability_of_common(consensus, gain, present) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("agree", "opposite", "taken"),
-    [(6, 4, 0.6), (5, 4, 0.55), (6, 5, 0), (5, 5, 0), (40, 0, 1), (40, 2, 0.95)],
-)
+@pytest.mark.parametrize(("agree", "opposite", "taken"), [
+    (6, 4, 0.6), (5, 4, 0.55), (6, 5, 0), (5, 5, 0), (40, 0, 1), (40, 2, 0.95),
+])  # fmt: skip
 def test_ties_of_a_dataset_of_two_frames_are_no_surer_than_its_counts(agree, opposite, taken):
     """Half a turn apart, both of a tie's placements are frames of the dataset."""
     half = np.diag([-1.0, -1.0, 1.0]) @ COMMON
@@ -229,18 +226,16 @@ def test_what_is_taken_is_fitted_as_aligning_would_fit_it(name, asked, model):
     assert found.model is model
     # As if another placement had been taken for the best.
     right = records.Placement(found.transform, found.score, 20.0)
-    other = replace(
-        found, transform=ELSEWHERE, deformation=None, figures=None, model=records.Model.RIGID,
-        placements=(right,),
-    )  # fmt: skip
+    stiff = {"deformation": None, "figures": None, "model": records.Model.RIGID}
+    other = replace(found, transform=ELSEWHERE, placements=(right,), **stiff)
     taken = take(other, 0, latents, BY)
     assert taken.deformation is None
     np.testing.assert_array_equal(taken.placements[0].transform, ELSEWHERE)
     assert taken.placements[0].displacement > 5
     settled = refit(taken, field, latents, parameters)
     assert (settled.model, settled.settled_by) == (model, BY)
-    stiff = model in (records.Model.RIGID, records.Model.SIMILARITY)
-    assert (settled.deformation is None) == stiff
+    undeformed = model in (records.Model.RIGID, records.Model.SIMILARITY)
+    assert (settled.deformation is None) == undeformed
     assert settled.quality == measure_quality(field, latents, settled.transform, parameters.radius)
     if asked == "auto":
         places = map_of(settled).places(latents.coords)

@@ -61,12 +61,6 @@ def test_the_size_is_the_mean_radius_wherever_a_ball_lies():
     assert surface_of(aside).size == surface_of(ball).size == pytest.approx(10, abs=0.2)
 
 
-def test_positions_are_counted_from_the_centre_of_the_cube():
-    middle = np.zeros((64, 64, 64), dtype=bool)
-    middle[20:44, 22:42, 30:34] = True  # as far from either end, so its centre is the cube's
-    np.testing.assert_allclose(surface_of(middle).centroid, 0.0, atol=1e-12)
-
-
 def test_the_boundary_is_that_of_the_filled_set():
     for solid in (chair(), boundary(chair())):
         rows = np.array(sorted(map(tuple, surface_of(solid).boundary.tolist())))

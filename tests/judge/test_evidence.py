@@ -10,6 +10,7 @@ from support.shapes import GRID, aligned, annotated, field_of, latents_of, surfa
 from slatprep import records
 from slatprep.align.figures import measure_figures
 from slatprep.geometry.frames import make_transform
+from slatprep.geometry.voxels import occupancy_of
 from slatprep.judge.confidence import class_confidence, voxel_figures
 from slatprep.judge.evidence import (
     FIGURES,
@@ -191,12 +192,9 @@ def test_rounding_beside_what_counts_as_the_same_decides_whether_labels_of_ties_
 def plain_field(values: np.ndarray) -> records.MaterialField:
     """Return a field without classes, of voxels (K, P) of properties that are not mapped."""
     voxels = np.argwhere(np.ones((64, 64, 64), dtype=bool))[: len(values)].astype(np.uint8)
-    solid = np.zeros((64, 64, 64), dtype=bool)
-    solid[tuple(voxels.T)] = True
     table = tuple(records.Property(f"p{k}", "1", False) for k in range(values.shape[1]))
-    nothing = np.zeros(len(values), np.uint8)
-    values = values.astype(np.float32)
-    return records.MaterialField(solid, voxels, nothing, values, table=table, classified=False)
+    given = occupancy_of(voxels), voxels, np.zeros(len(values), np.uint8), values.astype(np.float32)
+    return records.MaterialField(*given, table=table, classified=False)
 
 
 def as_annotation(field: records.MaterialField, rows: np.ndarray) -> records.Annotation:
@@ -312,9 +310,8 @@ def test_figures_of_a_voxel_by_hand():
     around = Surroundings(others, solid, *of_voxels)
     doubt, rough = -math.log(0.8 / 0.2), 0.2  # depths of -0.25 and 0.15 lie 0.2 about their mean
     by_hand = (others.tolist(), (5.0, 1.0), (0.25, 0.15), (0.5, 2.5))
-    for values, shares, distance, depth, moved in zip(
-        voxel_figures(around, 0.8).tolist(), *by_hand, strict=True
-    ):
+    found = voxel_figures(around, 0.8).tolist()
+    for values, shares, distance, depth, moved in zip(found, *by_hand, strict=True):
         row = dict(zip(VOXEL_FIGURES, values, strict=True))
         expected = {"distance": distance, "depth": depth, "moved": moved}
         expected |= {"asset_unsure": doubt, "asset_rough": rough}

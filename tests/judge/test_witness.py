@@ -41,8 +41,8 @@ def ids_of(part: int, number: int) -> list[str]:
     return [name for name in map(str, range(99)) if fold_of(name) == part][:number]
 
 
-def a_model(seed: int = 0) -> LatentModel:
-    rng = np.random.default_rng(seed)
+def a_model() -> LatentModel:
+    rng = np.random.default_rng(0)
     root = rng.normal(size=(8, 8))
     shares = np.array([0.3, 0.1, 0.2, 0.0, 0.25, 0.1, 0.05])
     return LatentModel(rng.normal(size=(7, 8)), root @ root.T + np.eye(8), shares)
@@ -106,9 +106,8 @@ def test_two_classes_in_two_parts_are_enough_for_models_and_less_is_not():
     assert fit_models((name, moments_of(feats, two)) for name in here + there) is not None
     assert fit_models((name, moments_of(feats, two)) for name in ids_of(0, 4)) is None
     assert fit_models([]) is None
-    assert (
-        fit_models([(here[0], moments_of(feats, two)), (there[0], moments_of(feats, one))]) is None
-    )
+    differ = [(here[0], moments_of(feats, two)), (there[0], moments_of(feats, one))]
+    assert fit_models(differ) is None
 
 
 def test_likelihoods_and_gain_are_those_of_gaussians():
@@ -188,10 +187,8 @@ def test_of_placements_the_voxels_count_that_have_a_class_under_all():
     model, there = a_model(), class_at(field)
     likely = model.log_likelihood(latents.feats)
     over = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
-    found = weigh(
-        field, latents, aligned(np.eye(4), over), labels, model,
-        SampleParameters(method="nearest", max_distance=2.0),
-    )  # fmt: skip
+    parameters = SampleParameters(method="nearest", max_distance=2.0)
+    found = weigh(field, latents, aligned(np.eye(4), over), labels, model, parameters)
     support, differing, voxels = np.zeros(2), 0, 0
     for row, (x, y, z) in enumerate(latents.coords.astype(int).tolist()):
         if max(z, 63 - z) > TOP - 1 + 2:
@@ -230,12 +227,8 @@ def test_a_turn_that_changes_few_classes_is_left_out():
         rim = (GRID[..., 2] < end) | (abs(GRID - [LOW[0], LOW[1], 30]) < 1).all(axis=-1)
         field = field_of(solid, rim)
         labels = rim[tuple(coords.T.astype(int))].astype(np.uint8)
-        shares = [
-            np.mean(labels != np.array([rim[tuple(v)] for v in turned]))
-            for turned in (
-                np.where(np.eye(3)[k], coords, 63 - coords.astype(int)) for k in range(3)
-            )
-        ]
+        turned = (np.where(axis, coords, 63 - coords.astype(int)) for axis in np.eye(3))
+        shares = [np.mean(labels != rim[tuple(voxels.T)]) for voxels in turned]
         assert sum(share > HARMLESS for share in shares) == turns
         found = weigh(field, latents, aligned(), labels, a_model(), SampleParameters())
         assert len(found.against) == turns
@@ -282,9 +275,7 @@ HEARD = [
 
 
 @pytest.mark.parametrize(("evidence", "witnesses", "agreeing", "factor"), HEARD)
-def test_a_factor_makes_log_likelihoods_log_odds_where_witnesses_agree(
-    evidence, witnesses, agreeing, factor
-):
+def test_a_factor_makes_log_odds_where_witnesses_agree(evidence, witnesses, agreeing, factor):
     found = reliability_of(apart(evidence))
     assert (found.witnesses, found.agreeing) == (witnesses, agreeing)
     assert (
@@ -370,9 +361,7 @@ is chosen: which, with what probability, what in log likelihood and voxels decid
 
 
 @pytest.mark.parametrize(("support", "differing", "reliability", "expected"), CHOICES)
-def test_the_likeliest_placement_is_taken_if_that_is_decisive(
-    support, differing, reliability, expected
-):
+def test_the_likeliest_placement_is_taken_if_decisive(support, differing, reliability, expected):
     tied = LatentEvidence(np.array(support), np.array(differing), 1000, 1.0, ())
     chosen = choice_of(tied, reliability)
     assert (chosen is None) == (expected is None)
@@ -432,10 +421,8 @@ class Asset:
         self.latents = StructuredLatents(latents_of(coords).coords, feats)
 
     def evidence(self, models: list[LatentModel], *tied: np.ndarray) -> LatentEvidence:
-        model = models[fold_of(self.object_id)]
-        return weigh(
-            self.field, self.latents, aligned(*tied), self.material, model, SampleParameters()
-        )
+        given = self.field, self.latents, aligned(*tied), self.material
+        return weigh(*given, models[fold_of(self.object_id)], SampleParameters())
 
 
 @cache
