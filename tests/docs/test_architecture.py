@@ -10,11 +10,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "design" / "architecture.md").read_text("utf-8")
+TOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]
 LAYERS = [
     {room.strip() for room in layer.split("|")}
-    for layer in tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"][
-        "importlinter"
-    ]["contracts"][0]["layers"]
+    for layer in TOOLS["importlinter"]["contracts"][0]["layers"]
 ]
 NAMES = sorted(set(re.findall(r"`(slatprep(?:\.\w+)+)`", PAGE)))
 PATHS = sorted(set(re.findall(r"`((?:slatprep|tests|docs)/[\w/.]*|[\w.]+\.(?:toml|yml))`", PAGE)))

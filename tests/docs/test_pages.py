@@ -106,9 +106,6 @@ def test_a_long_equation_scrolls_by_itself() -> None:
     assert inline.startswith("<math")
 
 
-# -- messages ---------------------------------------------------------------
-
-
 def templates() -> list[str]:
     """Return every text of the source, with … for what is filled in."""
     found = []
@@ -139,16 +136,10 @@ def test_messages_of_troubleshooting_are_those_of_the_source():
         assert any(map(pattern.search, said)), message
 
 
-# -- the shell --------------------------------------------------------------
-
-
-def complete(words: str, shell: str = "bash_complete") -> str:
+def complete(words: str) -> str:
     """Return what the entry answers to a shell that asks."""
-    asked = {
-        "_SLATPREP_COMPLETE": shell,
-        "COMP_WORDS": words,
-        "COMP_CWORD": str(len(words.split()) - 1),
-    }
+    last = str(len(words.split()) - 1)
+    asked = {"_SLATPREP_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": last}
     result = CliRunner().invoke(slatprep, env=asked, prog_name="slatprep")
     assert result.exit_code == 0, result.output
     return result.stdout

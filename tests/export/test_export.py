@@ -38,8 +38,6 @@ from slatprep.store import Store, open_store
 KINDS = ("hdf5", "npz")
 """A format of one file, and one of a folder."""
 
-# -- HDF5, WebDataset --------------------------------------------------
-
 
 def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
     out, stored = tmp_path / "all.h5", open_store(store)
@@ -111,19 +109,13 @@ def test_shards_are_read_by_webdataset(store, mixed, tmp_path):
         np.testing.assert_allclose(sample["json"]["transform"], QUARTER_TURN, atol=2e-3)
 
 
-# -- all of them ------------------------------------------------------------
-
-
 @pytest.mark.parametrize("format", FORMATS)
 def test_bytes_repeat_whatever_the_jobs(format, store, tmp_path):
     options = ExportOptions(shard_size=2)
     progress: list[tuple[int, int]] = []
     for name, jobs in (("one", 1), ("two", 2)):
-        out = tmp_path / name / "export"
-        export_store(
-            store, out, format, options=options, jobs=jobs,
-            progress=lambda done, total: progress.append((done, total)),
-        )  # fmt: skip
+        how = {"options": options, "jobs": jobs, "progress": lambda *at: progress.append(at)}
+        export_store(store, tmp_path / name / "export", format, **how)
         assert progress[-1] == (5, 5)
     one, two = bytes_of(tmp_path / "one" / "export"), bytes_of(tmp_path / "two" / "export")
     assert one == two and len(one) >= 1
@@ -333,9 +325,6 @@ def test_hostile_ids_stay_inside_every_export(format, copy, tmp_path):
         with tarfile.open(next(out.glob("*.tar"))) as tar:
             assert all("/" not in name for name in tar.getnames())
         assert {sample["json"]["asset_id"] for sample in samples_of(out)} == set(names)
-
-
-# -- killed exports --------------------------------------------------------
 
 
 def test_an_export_removes_what_a_killed_one_left_and_nothing_else(tmp_path):

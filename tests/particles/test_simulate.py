@@ -373,9 +373,6 @@ def test_gaussians_of_trellis_fall_as_the_object_does(tmp_path):
         assert animation.n_frames >= 6
 
 
-# -- the examples ---------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[np.ndarray, ...]]:
     folder = tmp_path_factory.mktemp("drop")

@@ -109,9 +109,6 @@ def test_wrong_axes_are_an_error_that_names_the_right_ones(axes, turn, store, tr
         assert not (tmp_path / "m.ply").exists()
 
 
-# -- axes of TRELLIS and of SAM 3D Objects -----------------------------
-
-
 def write_prediction(path: Path, coords: np.ndarray, material: np.ndarray) -> None:
     values = np.tile([1e5, 1e3, 0.3], (len(coords), 1)) * (1 + material[:, None] * [1, 1, 0])
     np.savez(path, coords=coords, material=material, properties_si=values)
@@ -168,9 +165,7 @@ def test_particles_that_are_far_are_told_or_an_error(store, true_parts, tmp_path
     ([name for name in GAUSSIAN if name[0] != "n"], 0.4, "it has no normals"),
     (GAUSSIAN, 3.0, "it reaches 3 from the centre, out of the unit cube"),
 ])  # fmt: skip
-def test_gaussians_of_another_tool_are_not_taken_for_trellis(
-    names, reach, sign, store, true_parts, tmp_path
-):
+def test_gaussians_of_another_tool_are_told_apart(names, reach, sign, store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 400, 0.45)
     write_points(tmp_path / "g.ply", positions * reach / abs(positions).max(), names)
     read = read_particles(tmp_path / "g.ply")
