@@ -46,12 +46,9 @@ def locked(name: str) -> dict[str, list[Requirement]]:
 def test_what_is_declared_is_locked_within_its_bounds(file, extras):
     pins = locked(file) | locked("torch.txt")
     for requirement in declared(*extras):
-        assert canonicalize_name(requirement.name) in pins, f"{requirement}: run `make lock`"
-        here = [
-            pin
-            for pin in pins[canonicalize_name(requirement.name)]
-            if pin.marker is None or pin.marker.evaluate()
-        ]
+        name = canonicalize_name(requirement.name)
+        assert name in pins, f"{requirement}: run `make lock`"
+        here = [pin for pin in pins[name] if pin.marker is None or pin.marker.evaluate()]
         if requirement.marker is None or requirement.marker.evaluate():
             (pin,) = here
             (version,) = (specifier.version for specifier in pin.specifier)
