@@ -53,16 +53,12 @@ class Pipeline:
         torch.rand(3)  # what is drawn before the seed is set must not matter
         return {"cond": float(np.asarray(image[0]).mean()), "neg_cond": 0.0}
 
-    def sample_sparse_structure(
-        self, cond: dict, num_samples: int = 1, sampler_params: dict | None = None
-    ) -> torch.Tensor:
+    def sample_sparse_structure(self, cond, num_samples=1, sampler_params=None) -> torch.Tensor:
         assert num_samples == 1 and not sampler_params and not torch.is_grad_enabled()
         coords = torch.from_numpy(make_asset(0).coords[: self.voxels].astype(np.int64))
         return torch.nn.functional.pad(coords[torch.randperm(len(coords))], (1, 0))
 
-    def sample_slat(
-        self, cond: dict, coords: torch.Tensor, sampler_params: dict | None = None
-    ) -> Any:
+    def sample_slat(self, cond: dict, coords: torch.Tensor, sampler_params=None) -> Any:
         drawn = torch.randn(len(coords), 8) + cond["cond"]
         return SimpleNamespace(coords=coords, feats=drawn * torch.tensor(STD) + torch.tensor(MEAN))
 
@@ -306,8 +302,7 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(images, tmp_pa
     with_trellis(monkeypatch, lambda name: pipeline, None)
     words = [*map(str, images), "--out", str(tmp_path / "slat"), "--seed", "7"]
     assert trellis_latents.main(words) == 1  # The cup has no foreground; the bear is done.
-    made = sorted(path.name for path in (tmp_path / "slat").iterdir())
-    assert made == ["bear.json", "bear.npz"]
+    assert sorted(path.name for path in (tmp_path / "slat").iterdir()) == ["bear.json", "bear.npz"]
     assert pipeline.device == torch.device("cuda")
     run(work.Session(Pipeline(), torch, {}), images[1:], tmp_path / "b", 7)
     with np.load(tmp_path / "slat" / "bear.npz") as one, np.load(tmp_path / "b/bear.npz") as two:

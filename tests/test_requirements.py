@@ -93,5 +93,4 @@ def test_continuous_integration_covers_the_versions_that_are_stated():
 
 def test_issue_forms_have_what_their_reader_wants():
     for form in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml"):
-        document = yaml.safe_load(form.read_text("utf-8"))
-        assert {"name", "description", "body"} <= set(document)
+        assert {"name", "description", "body"} <= set(yaml.safe_load(form.read_text("utf-8")))

@@ -136,8 +136,7 @@ def test_near_is_a_factor_of_two_and_a_fifth_of_the_mean():
         ((1e6, 1e6), (0.199, 0.301)),
     ):
         said = [_said([1], [e], [nu]) for e, nu in zip(modulus, ratio, strict=True)]
-        made = merge(said, PROPERTIES)
-        likely.append(float(made.confidence[0]))
+        likely.append(float(merge(said, PROPERTIES).confidence[0]))
     np.testing.assert_allclose(likely, [0.8, 0.4, 0.8, 0.4], rtol=1e-6)
 
 

@@ -93,8 +93,7 @@ def test_accuracy_on_demo_data(level, demo_cases):
             assert alignment.model == "similarity" and abs(scales[0] / scales[1] - 1) < 0.02
         annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
         # Of a warped shape the truth has the similarity alone.
-        places = places_of(latents.centres, alignment.transform)
-        unbent = replace(annotation, place=places)
+        unbent = replace(annotation, place=places_of(latents.centres, alignment.transform))
         score = compare_with_truth(truth.name, truth, field, latents, unbent)
         scores += [] if score.symmetric else [score]
     assert len(scores) >= 4
@@ -191,8 +190,7 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name):
         assert isinstance(judgement.verdict, Verdict)
         assert (judgement.verdict is Verdict.GOOD) == (not judgement.reasons)
     if name in ("a dozen", "two far blobs"):
-        same = align(field, own, DEFAULT)
-        assert displacement(same.transform, np.eye(4), own.centres) < 0.01
+        assert displacement(align(field, own, DEFAULT).transform, np.eye(4), own.centres) < 0.01
 
 
 @settings(max_examples=15)

@@ -340,8 +340,7 @@ def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(squas
     own = best.similarity
     beside = [replace(best, similarity=own._replace(rotation=t @ own.rotation)) for t in turns]
     better = next(b for b in beside if search.stretched(pair, [best, b], [best]) == [b])
-    found = search.ranked(pair, [best, better], [best])
-    assert any(off(pair, pose, best) == 0.0 for pose in found)
+    assert any(off(pair, pose, best) == 0.0 for pose in search.ranked(pair, [best, better], [best]))
 
 
 def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squashed):
@@ -360,8 +359,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squ
 
 def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(squashed):
     pair, poses = squashed
-    fine = pair.refine(poses, FINE._replace(size_by_slat=True))
-    many = pair.distinct(fine)
+    many = pair.distinct(pair.refine(poses, FINE._replace(size_by_slat=True)))
     assert len(many) > MOST_CONTESTED + 2
     found, _ = finish(pair, poses, rough=True)
     for pose in many[MOST_CONTESTED:]:

@@ -14,8 +14,7 @@ from slatprep.geometry.voxels import boundary, filled, voxels_of
 
 def test_a_shell_and_its_solid_have_the_same_surface():
     solid = chair()
-    shell = boundary(solid)
-    here, there = surface_of(shell), surface_of(solid)
+    here, there = surface_of(boundary(solid)), surface_of(solid)
     np.testing.assert_array_equal(here.distance, there.distance)
     np.testing.assert_array_equal(here.points, there.points)
     np.testing.assert_array_equal(here.boundary, there.boundary)

@@ -33,8 +33,7 @@ def test_every_name_and_path_exists():
 
 def test_every_room_has_its_line():
     section = PAGE.split("## The rooms")[1].split("\n## ")[0]
-    told = set(re.findall(r"`slatprep/(\w+)(?:/|\.py)`", section))
-    assert told == set().union(*LAYERS)
+    assert set(re.findall(r"`slatprep/(\w+)(?:/|\.py)`", section)) == set().union(*LAYERS)
 
 
 def test_the_picture_has_the_floors_that_are_checked():

@@ -271,8 +271,7 @@ def test_world_bounds_of_the_records_are_used(make_dataset: MakeDataset, tmp_pat
     np.savez(file, min_bounds=lo, max_bounds=hi, grid_shape=(64, 64, 64))
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     options = ExportOptions(points="grid", frame="pixieverse")
-    done = export_store(summary.store, tmp_path / "ply", "ply", options=options)
-    assert done.notes == ()
+    assert export_store(summary.store, tmp_path / "ply", "ply", options=options).notes == ()
     vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
     voxels = np.argwhere(dataset.assets["cup"].grid[..., 3] != 7)
     expected = np.take_along_axis(np.linspace(lo, hi, 64), voxels, axis=0)

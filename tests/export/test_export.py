@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -213,8 +214,7 @@ def test_a_disk_that_is_full_ends_no_process(format, store, tmp_path):
         "    except SlatprepError as error: print(error, os.listdir(sys.argv[2]))\n"
     )
     command = [sys.executable, "-c", code, str(store), str(tmp_path), format]
-    told = subprocess.run(command, capture_output=True, text=True, check=True)
-    lines = told.stdout.splitlines()
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert len(lines) == 4
     for line in lines:
         assert f"cannot be written to {tmp_path} (File too large); nothing was replaced" in line
@@ -236,10 +236,7 @@ def test_a_link_stays_and_a_failed_export_leaves_the_old_one(format, store, tmp_
         export_store(store, store / "voxel" / "export", format)
     assert not (store / "voxel" / "export").exists()
 
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Store, "asset", fail)
+    monkeypatch.setattr(Store, "asset", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(SlatprepError, match=r"cannot be written to .* \(No space left"):
         export_store(store, fresh, format)
     assert bytes_of(fresh) == before

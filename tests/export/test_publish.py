@@ -226,8 +226,7 @@ def test_croissant_is_valid_without_a_warning(store, tmp_path, caplog):
     assert dataset.metadata.ctx.issues.report() == ""
     assert caplog.text == ""
     assert dataset.metadata.name == store.stem
-    sets = {node.id for node in dataset.metadata.distribution}
-    assert sets >= {layout.name for layout in ARRAYS}
+    assert {node.id for node in dataset.metadata.distribution} >= {layout.name for layout in ARRAYS}
 
 
 def test_croissant_s_records_are_the_store_s(store, tmp_path):

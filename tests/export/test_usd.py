@@ -189,8 +189,7 @@ def test_a_ratio_of_one_half_is_clipped_and_said(make_dataset, tmp_path):
     dataset.write_grid("a", grid)
     built = build_store(dataset.parameters(), tmp_path / "s.zarr")
     done = export_store(str(built.store), tmp_path / "usd", "usd")
-    said = f"nu of {soft.sum():,} points was above {MAX_POISSON} and is written so"
-    assert said in done.notes
+    assert f"nu of {soft.sum():,} points was above {MAX_POISSON} and is written so" in done.notes
     stage = Usd.Stage.Open(str(tmp_path / "usd" / "a.usdc"))
     ratio = materials_of(stage, "/Asset/Points")["newton:mpm:poissonsRatio"]
     assert ratio.max() == pytest.approx(MAX_POISSON)

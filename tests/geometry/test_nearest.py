@@ -131,8 +131,7 @@ def test_each_vote_is_of_its_own_labels():
     point = voxel_centres([[30.4, 20, 20]])
     held = VoxelIndex(voxels)
     for labels, winner in (([0] * 4, 0), ([2, 5, 5, 5], 1), ([0] * 4, 0)):
-        voted = held.voted(point, np.array(labels, np.uint8), 1.0, 2.0)[1]
-        assert voted.tolist() == [winner]
+        assert held.voted(point, np.array(labels, np.uint8), 1.0, 2.0)[1].tolist() == [winner]
 
 
 def test_of_a_drawn_vote_the_lower_label_wins():

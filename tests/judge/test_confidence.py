@@ -305,8 +305,7 @@ def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(of_a
 
 
 def test_own_objects_pass_and_other_objects_fail(cases, judged):
-    confidences = [judgement.confidence for judgement, _, _ in judged]
-    assert np.median(confidences) > 0.9
+    assert np.median([judgement.confidence for judgement, _, _ in judged]) > 0.9
     assert sum(judgement.verdict is Verdict.FAILED for judgement, _, _ in judged) <= 1
     for k, (field, _, truth) in enumerate(cases):
         _, latents, other = cases[(k + 3) % len(cases)]

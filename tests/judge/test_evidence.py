@@ -115,8 +115,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
     tower = np.zeros((64, 64, 64), dtype=bool)
     tower[20:44, 20:44] = True
     field = field_of(tower, np.where(GRID[..., 2] < 32, 1, 3))
-    voxels = np.array([[32, 32, 31], [32, 32, 29], [32, 32, 10], [32, 32, 1]])
-    latents = latents_of(voxels)
+    latents = latents_of(np.array([[32, 32, 31], [32, 32, 29], [32, 32, 10], [32, 32, 1]]))
     annotation = annotated(np.array([1, 1, 1, 255]), latents.centres)
     around = surroundings_of(field, latents, fitted(), annotation)
     # Of 14 cells one and four lie above: 1, 2, 4, 7 voxels along the axis, 1, 1, 2, 4 diagonally.
@@ -207,12 +206,10 @@ def as_annotation(field: records.MaterialField, rows: np.ndarray) -> records.Ann
 def test_labels_without_classes_are_the_nearest_tenths_or_coarser(properties, parts):
     # Eleven tenths to the power of 1, 2 and 3 are 11, 121 and 1331; six fifths are 216 at the
     # third, 1296 at the fourth; and the three steps of 0, 0.4 and 0.8 are 81.
-    rng = np.random.default_rng(0)
-    values = rng.random((3000, properties))
+    values = np.random.default_rng(0).random((3000, properties))
     values[:2] = [[0.0], [1.0]]
     field = plain_field(5.0 + 3.0 * values)
-    rows = np.array([4, -1, 0, 77])
-    cells, own = _labels_of(field, as_annotation(field, rows))
+    cells, own = _labels_of(field, as_annotation(field, np.array([4, -1, 0, 77])))
     _, expected = np.unique(np.rint(values * parts), axis=0, return_inverse=True)
     pairs = set(zip(cells.tolist(), expected.reshape(-1).tolist(), strict=True))
     assert len(pairs) == len({label for label, _ in pairs}) == expected.max() + 1
@@ -233,8 +230,7 @@ def test_labels_are_made_coarser_where_255_are_too_few():
 
 def test_no_label_is_that_of_nothing_however_many_combinations_there_are():
     # Nine properties that are either 0 or 1 have 512 combinations, however coarse.
-    values = np.argwhere(np.ones((2,) * 9, dtype=bool)).astype(float)
-    field = plain_field(values)
+    field = plain_field(np.argwhere(np.ones((2,) * 9, dtype=bool)).astype(float))
     cells, own = _labels_of(field, as_annotation(field, np.arange(512)))
     np.testing.assert_array_equal(cells, np.minimum(np.arange(512), 254))
     np.testing.assert_array_equal(own, cells)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -79,8 +80,7 @@ def test_verdicts_by_fitness_alone(fitness, backward, verdict, word):
 
 
 def test_a_tie_that_something_settled_is_as_good_as_its_probability():
-    settled = said_of(ambiguity=0.4, same_object=0.99, right_placement=0.97)
-    assert settled == (Verdict.GOOD, ())
+    assert said_of(ambiguity=0.4, same_object=0.99, right_placement=0.97) == (Verdict.GOOD, ())
     still_open, _ = said_of(ambiguity=0.4, ties=1, same_object=0.99, right_placement=0.97)
     assert still_open is Verdict.DOUBTFUL
 
@@ -182,8 +182,7 @@ def test_samples_that_agree_add_no_reason(alone, likely):
     together = merged(before, annotation(likely))
     assert together.expected_accuracy == pytest.approx(np.mean(likely))
     assert replace(together, expected_accuracy=alone) == before
-    just = merged(judgement(Verdict.GOOD, 0.75), annotation([0.5]))
-    assert just.verdict is Verdict.DOUBTFUL
+    assert merged(judgement(Verdict.GOOD, 0.75), annotation([0.5])).verdict is Verdict.DOUBTFUL
 
 
 @pytest.mark.parametrize("likely", [None, []])
@@ -355,18 +354,13 @@ def test_the_voxels_of_a_full_grid_that_are_looked_at_lie_in_all_of_its_layers(m
     """Classes repeat every eight layers, as would steps of eight in a grid that is in order."""
     full = np.ones((64, 64, 64), dtype=bool)
     field = field_of(full, np.where(GRID[..., 2] % 8 == 0, 1, 3))
-    latents = latents_of(np.argwhere(full))
-    looked: list[int] = []
-
-    def counted(field: MaterialField, places: np.ndarray, *rest: Any, **options: Any) -> Any:
-        looked.append(len(places))
-        return sample(field, places, *rest, **options)
-
-    monkeypatch.setattr("slatprep.judge.ambiguity.sample", counted)
+    latents, watched = latents_of(np.argwhere(full)), Mock(wraps=sample)
+    monkeypatch.setattr("slatprep.judge.ambiguity.sample", watched)
     upside_down = aligned(np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0]))
     some = measure_ambiguity(field, latents, upside_down, PARAMETERS)
     # Layers 0, 8, 16... change with layers 7, 15, 23...: two of eight.
     assert some.material_share == pytest.approx(0.25, abs=0.01)
+    looked = [len(called.args[1]) for called in watched.call_args_list]
     assert looked == [pytest.approx(MOST_VOXELS / FEWER, rel=0.05)] * 2
 
 

@@ -99,8 +99,7 @@ def test_a_model_has_the_moments_of_the_classes_about_their_means():
 
 
 def test_two_classes_in_two_parts_are_enough_for_models_and_less_is_not():
-    rng = np.random.default_rng(2)
-    feats = rng.normal(size=(40, 8)).astype(np.float32)
+    feats = np.random.default_rng(2).normal(size=(40, 8)).astype(np.float32)
     two, one = np.repeat([1, 4], 20).astype(np.uint8), np.full(40, 4, dtype=np.uint8)
     here, there = ids_of(0, 1), ids_of(1, 1)
     assert fit_models((name, moments_of(feats, two)) for name in here + there) is not None
@@ -138,8 +137,7 @@ def box(classes: str) -> tuple[MaterialField, StructuredLatents, NDArray[np.uint
     by = {"levels": upper[..., 2], "octants": upper @ [1, 2, 4] % 7}[classes]
     material = by.astype(np.uint8)
     coords = voxels_of(boundary(solid))
-    rng = np.random.default_rng(4)
-    feats = rng.normal(size=(len(coords), 8)).astype(np.float32)
+    feats = np.random.default_rng(4).normal(size=(len(coords), 8)).astype(np.float32)
     labels = material[tuple(coords.T.astype(int))]
     labels[(coords[:, 2] >= TOP) | (coords[:, 0] % 5 == 0)] = UNANNOTATED
     annotated = solid & (GRID[..., 2] < TOP)
@@ -148,8 +146,7 @@ def box(classes: str) -> tuple[MaterialField, StructuredLatents, NDArray[np.uint
 
 
 def class_at(field: MaterialField) -> dict[tuple[int, ...], int]:
-    voxels = map(tuple, field.voxels.tolist())
-    return dict(zip(voxels, field.material.tolist(), strict=True))
+    return dict(zip(map(tuple, field.voxels.tolist()), field.material.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(("classes", "axes"), [("levels", [0, 1]), ("octants", [0, 1, 2])])
@@ -288,8 +285,7 @@ def test_assets_of_one_object_are_one_witness():
     """They share their latents or their labels, and agree or differ together."""
     same = [(f"{k % 3}", compared([1.0])) for k in range(36)]
     assert (found := reliability_of(same)).factor == 0.0 and found.witnesses == 3
-    rows = [(str(k), compared([0.25])) for k in range(20) for _ in range(k + 1)]
-    found = reliability_of(rows)
+    found = reliability_of([(str(k), compared([0.25])) for k in range(20) for _ in range(k + 1)])
     assert (found.witnesses, found.agreeing) == (20, 20)
     assert found.factor == pytest.approx(np.log(21.0) / 0.25)
     # An object agrees if most of its assets do.

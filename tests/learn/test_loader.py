@@ -102,8 +102,7 @@ def test_batch_is_what_zarr_reads(learn_store):
     np.testing.assert_allclose(batch.feats, feats, rtol=1e-5, atol=1e-6)
     valid = root["voxel/valid"][rows]
     np.testing.assert_array_equal(batch.valid, valid)
-    properties = np.nan_to_num(root["voxel/properties"][rows])
-    np.testing.assert_array_equal(batch.properties, properties)
+    np.testing.assert_array_equal(batch.properties, np.nan_to_num(root["voxel/properties"][rows]))
     material = np.where(valid, root["voxel/material"][rows].astype(int), learn.IGNORED)
     np.testing.assert_array_equal(batch.material, material)
     spans = list(itertools.pairwise(offset[:4].tolist()))
@@ -143,8 +142,7 @@ def test_no_worker_reads_another_store_at_the_same_path(learn_copy):
 
 
 def test_a_plain_loader_augments_each_epoch_anew(learn_store):
-    ours = learn.SlatDataset(learn_store, augmentation="all", seed=3)
-    loader = learn.SlatLoader(ours, 3)
+    loader = learn.SlatLoader(learn.SlatDataset(learn_store, augmentation="all", seed=3), 3)
     dataset = learn.SlatDataset(learn_store, augmentation="all", seed=3)
     plain = DataLoader(dataset, 3, collate_fn=learn.collate, num_workers=2)
     found = []
@@ -312,8 +310,7 @@ def test_shifted_windows_carry_news_further(model):
     coords = torch.tensor([[0, 7, 0, 0], [0, 8, 0, 0], [0, 40, 40, 40]], dtype=torch.int32)
     feats = torch.zeros(3, 8, requires_grad=True)
     model(coords, feats).properties[0].sum().backward()
-    reached = feats.grad.abs().sum(dim=1) > 0
-    assert reached.tolist() == [True, True, False]
+    assert (feats.grad.abs().sum(dim=1) > 0).tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize("channels", [24, 64])

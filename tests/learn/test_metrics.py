@@ -173,8 +173,7 @@ def test_equal_scores_are_no_class(learn_store, tmp_path):
         return arrays | {"logits": scores}
 
     store = open_store(learn_store)
-    folder = write_changed(tmp_path / "p", learn_store, change)
-    result = evaluate_store(folder, learn_store, None)
+    result = evaluate_store(write_changed(tmp_path / "p", learn_store, change), learn_store, None)
     by_object: dict[str, list[float]] = {}
     for row, name in enumerate(store.column("object_id")):
         valid = store.read(row, ("valid",))["valid"]

@@ -126,8 +126,7 @@ def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint, tmp_path):
     assert np.array_equal(np.load(out / "a.npz")["properties"], first)
     words = ("predict", slats, "--checkpoint", checkpoint, "--out", out, "--asset", "b.fron_t")
     assert f"{slats} has no asset 'b.fron_t'; did you mean b.front?" in refused(*words)
-    carried = predicted_field(out / "a.npz", None)
-    assert np.array_equal(carried.voxels, random_latents(1).coords)
+    assert np.array_equal(predicted_field(out / "a.npz", None).voxels, random_latents(1).coords)
 
 
 @pytest.mark.parametrize("command", ["predict", "train"])
@@ -358,15 +357,13 @@ def test_latents_of_an_encoder_without_moments_are_standardised_or_refused(check
     contents = replace(PIXIEVERSE, latents=LatentSpace("mine", 8, 64, standardised=True))
     model, ranges = make_decoder("small", contents), normalization_of(RANGES, "dataset")
     torch.save(checkpoint_state(model, "small", ranges, contents), checkpoint / "best.pt")
-    rng = np.random.default_rng(5)
-    feats = rng.normal(0.7, 0.9, (300, 8)).astype(np.float32)
+    feats = np.random.default_rng(5).normal(0.7, 0.9, (300, 8)).astype(np.float32)
     latents = replace(random_latents(5), feats=feats)
     save(tmp_path / "slats" / "a.npz", latents)
     words = (tmp_path / "slats", "--checkpoint", checkpoint, "--out", tmp_path / "p")
     told = run(*words)
     assert told["predicted"] == 1
-    said = replace(latents, standardised=True)
-    (field,) = predict(load_checkpoint(checkpoint), [said])
+    (field,) = predict(load_checkpoint(checkpoint), [replace(latents, standardised=True)])
     np.testing.assert_allclose(np.load(tmp_path / "p" / "a.npz")["properties"], field.properties)
     raw = tmp_path / "raw"
     save(raw / "a.npz", replace(latents, feats=3 * feats))

@@ -96,10 +96,9 @@ def test_values_that_are_no_prediction_are_named(learn_store, tmp_path, name, va
 
 
 def test_what_lies_beside_a_prediction_is_not_unpacked(learn_store, tmp_path):
-    def more(truth: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return zeros(truth) | {"beside": np.array([{}], object)}
-
-    for file in write_predictions(tmp_path / "p", learn_store, more).iterdir():
+    more = {"beside": np.array([{}], object)}
+    write_predictions(tmp_path / "p", learn_store, lambda truth: zeros(truth) | more)
+    for file in (tmp_path / "p").iterdir():
         with zipfile.ZipFile(file, "a") as archive:
             archive.writestr("worse.npy", b"no array")
     assert evaluate_store(tmp_path / "p", learn_store, None).missing == []

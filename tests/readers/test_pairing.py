@@ -156,8 +156,7 @@ def test_two_slats_for_one_id(find, files):
 
 @pytest.mark.parametrize("what", ["grid", "mask"])
 def test_two_files_of_a_kind_for_one_id(find, what):
-    own = {what: ("*/{id}.npy",)}
-    (pair,) = find(["x/a.npy", "y/a.npy", grid("a")], ["a.npz"], pixieverse=own)
+    (pair,) = find(["x/a.npy", "y/a.npy", grid("a")], ["a.npz"], pixieverse={what: ("*/{id}.npy",)})
     assert re.search(f"2 {what}(s| files) for one id .*\\(x/a.npy, y/a.npy\\)", pair.problem)
 
 
@@ -186,8 +185,7 @@ def test_ids_that_are_no_plain_name(find):
     for pair in find(map(grid, names), [f"{name}.npz" for name in names]):
         name = pair.grid.parents[1].name
         files = f"{f'{name}/sample_0/material_grid.npy'!r}, {f'{name}.npz'!r}"
-        told = f"id {pair.asset_id!r} is not allowed: rename {files}, to '"
-        assert pair.problem.startswith(told)
+        assert pair.problem.startswith(f"id {pair.asset_id!r} is not allowed: rename {files}, to '")
         assert "255 letters A to Z and a to z" in pair.problem
         assert "\n" not in pair.problem
         assert pair.mask is None

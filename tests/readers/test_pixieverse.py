@@ -147,8 +147,7 @@ def test_a_mask_that_contradicts_its_grid_is_told_or_refused(make_pair):
     *_, told = read_field(make_pair(grid=grid, mask=part)).warnings
     assert "leaves out 70% of the voxels with a class, and 0% of it is" in told
     for plausibility, tells in (("warn", True), ("off", False)):
-        roots = replace(other.roots, plausibility=plausibility)
-        field = read_field(replace(other, roots=roots))
+        field = read_field(replace(other, roots=replace(other.roots, plausibility=plausibility)))
         assert len(field.voxels) == 300
         assert any("unusual masks" in text for text in field.warnings) == tells
 
@@ -248,8 +247,7 @@ def test_an_asset_fails_by_the_share_of_its_unphysical_voxels(make_pair):
 
 @pytest.mark.parametrize("material", [-1, 7], ids=["without class", "outside the object"])
 def test_values_of_a_voxel_that_is_not_annotated_do_not_matter(make_pair, material):
-    grid = changed(RAW, ((30, 30, 30), (np.nan, -1, 9, material)))
-    read = read_field(make_pair(grid=grid))
+    read = read_field(make_pair(grid=changed(RAW, ((30, 30, 30), (np.nan, -1, 9, material)))))
     assert read.voxels.tolist() == VOXELS
     assert read.unphysical == 0
 

@@ -27,8 +27,7 @@ def test_pixie_s_rule_is_torch_s_random_split(count):
     torch = pytest.importorskip("torch")
     ids = [f"{k:032x}" for k in range(count)]
     permutation = torch.randperm(count, generator=torch.Generator().manual_seed(42)).tolist()
-    expected = [ids[k] for k in permutation[int(0.9 * count) :]]
-    assert pixie_test_objects(reversed(ids)) == expected
+    assert pixie_test_objects(reversed(ids)) == [ids[k] for k in permutation[int(0.9 * count) :]]
 
 
 def test_pixie_s_rule_without_torch():
