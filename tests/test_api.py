@@ -65,9 +65,6 @@ def test_doctests_run(name):
     assert failed == 0
 
 
-# -- two voxel sets ---------------------------------------------------------
-
-
 def field_of(asset: Asset) -> slatprep.MaterialField:
     material = asset.grid[..., 3]
     voxels = np.argwhere(material != 7).astype(np.uint8)

@@ -20,8 +20,8 @@ from PIL import Image, PngImagePlugin
 from support import commands
 from support.synthetic import make_asset
 
-from slatprep import extract, trellis_latents
 from slatprep import extract as work
+from slatprep import trellis_latents
 from slatprep.errors import ConfigError, InputError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_latents
@@ -53,16 +53,12 @@ class Pipeline:
         torch.rand(3)  # what is drawn before the seed is set must not matter
         return {"cond": float(np.asarray(image[0]).mean()), "neg_cond": 0.0}
 
-    def sample_sparse_structure(
-        self, cond: dict, num_samples: int = 1, sampler_params: dict | None = None
-    ) -> torch.Tensor:
+    def sample_sparse_structure(self, cond, num_samples=1, sampler_params=None) -> torch.Tensor:
         assert num_samples == 1 and not sampler_params and not torch.is_grad_enabled()
         coords = torch.from_numpy(make_asset(0).coords[: self.voxels].astype(np.int64))
         return torch.nn.functional.pad(coords[torch.randperm(len(coords))], (1, 0))
 
-    def sample_slat(
-        self, cond: dict, coords: torch.Tensor, sampler_params: dict | None = None
-    ) -> Any:
+    def sample_slat(self, cond: dict, coords: torch.Tensor, sampler_params=None) -> Any:
         drawn = torch.randn(len(coords), 8) + cond["cond"]
         return SimpleNamespace(coords=coords, feats=drawn * torch.tensor(STD) + torch.tensor(MEAN))
 
@@ -70,6 +66,18 @@ class Pipeline:
 @pytest.fixture
 def session() -> work.Session:
     return work.Session(Pipeline(), torch, {"name": "m", "revision": "abc"})
+
+
+def with_trellis(monkeypatch: pytest.MonkeyPatch, from_pretrained: Any, download: Any) -> None:
+    """Install TRELLIS and the hub's library, of which these functions are asked."""
+    loader = SimpleNamespace(from_pretrained=from_pretrained)
+    fakes = {
+        "trellis": ModuleType("trellis"),
+        "trellis.pipelines": SimpleNamespace(TrellisImageTo3DPipeline=loader),
+        "huggingface_hub": SimpleNamespace(snapshot_download=download),
+    }
+    for name, module in fakes.items():
+        monkeypatch.setitem(sys.modules, name, module)
 
 
 def has_gpu(monkeypatch: pytest.MonkeyPatch, has: bool) -> None:
@@ -147,9 +155,7 @@ def test_names(tmp_path):
         work.list_extractions([tmp_path / ".hidden.png"], tmp_path, [1], False)
 
 
-def test_a_run_that_stopped_before_its_latents_were_there_goes_on(
-    session, images, tmp_path, monkeypatch
-):
+def test_a_run_that_stopped_before_its_latents_goes_on(session, images, tmp_path, monkeypatch):
     put, staged = [], work.staged
 
     @contextmanager
@@ -235,14 +241,7 @@ def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatc
         asked.append(path)
         return pipeline
 
-    loader = SimpleNamespace(from_pretrained=from_pretrained)
-    fakes = {
-        "trellis": ModuleType("trellis"),
-        "trellis.pipelines": SimpleNamespace(TrellisImageTo3DPipeline=loader),
-        "huggingface_hub": SimpleNamespace(snapshot_download=snapshot_download),
-    }
-    for name, module in fakes.items():
-        monkeypatch.setitem(sys.modules, name, module)
+    with_trellis(monkeypatch, from_pretrained, snapshot_download)
     words = ("--out", tmp_path / "slat", "--json", "--revision", "v1", "--no-preprocess")
     result = commands.run("extract-slat", *images, *words)
     document = json.loads(result.stdout)
@@ -256,12 +255,7 @@ def test_command_loads_one_commit_of_the_model(gpu, images, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("error", [OSError("401 gated"), KeyError("x"), ValueError("a/b/c")])
 def test_a_model_that_cannot_be_loaded_is_told(error, images, tmp_path, monkeypatch):
-    loader = SimpleNamespace(from_pretrained=Mock(side_effect=error))
-    fake = SimpleNamespace(TrellisImageTo3DPipeline=loader)
-    monkeypatch.setitem(sys.modules, "trellis", ModuleType("trellis"))
-    monkeypatch.setitem(sys.modules, "trellis.pipelines", fake)
-    hub = SimpleNamespace(snapshot_download=lambda name, revision: str(tmp_path))
-    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    with_trellis(monkeypatch, Mock(side_effect=error), lambda name, revision: str(tmp_path))
     words = ("--model", "no/such", "--out", tmp_path / "o")
     told = commands.refused("extract-slat", images[0], *words)
     assert len(told.splitlines()) == 1
@@ -305,17 +299,12 @@ def test_it_writes_what_extract_slat_writes_and_build_store_reads(images, tmp_pa
             return super().preprocess_image(input)
 
     pipeline = Printing()
-    loader = SimpleNamespace(from_pretrained=lambda name: pipeline)
-    module = SimpleNamespace(TrellisImageTo3DPipeline=loader)
-    monkeypatch.setitem(sys.modules, "trellis", ModuleType("trellis"))
-    monkeypatch.setitem(sys.modules, "trellis.pipelines", module)
+    with_trellis(monkeypatch, lambda name: pipeline, None)
     words = [*map(str, images), "--out", str(tmp_path / "slat"), "--seed", "7"]
     assert trellis_latents.main(words) == 1  # The cup has no foreground; the bear is done.
-    made = sorted(path.name for path in (tmp_path / "slat").iterdir())
-    assert made == ["bear.json", "bear.npz"]
+    assert sorted(path.name for path in (tmp_path / "slat").iterdir()) == ["bear.json", "bear.npz"]
     assert pipeline.device == torch.device("cuda")
-    session = extract.Session(Pipeline(), torch, {})
-    list(extract.extract(session, extract.list_extractions(images[1:], tmp_path / "b", [7], False)))
+    run(work.Session(Pipeline(), torch, {}), images[1:], tmp_path / "b", 7)
     with np.load(tmp_path / "slat" / "bear.npz") as one, np.load(tmp_path / "b/bear.npz") as two:
         for name in ("coords", "feats"):
             np.testing.assert_array_equal(one[name], two[name])

@@ -46,12 +46,9 @@ def locked(name: str) -> dict[str, list[Requirement]]:
 def test_what_is_declared_is_locked_within_its_bounds(file, extras):
     pins = locked(file) | locked("torch.txt")
     for requirement in declared(*extras):
-        assert canonicalize_name(requirement.name) in pins, f"{requirement}: run `make lock`"
-        here = [
-            pin
-            for pin in pins[canonicalize_name(requirement.name)]
-            if pin.marker is None or pin.marker.evaluate()
-        ]
+        name = canonicalize_name(requirement.name)
+        assert name in pins, f"{requirement}: run `make lock`"
+        here = [pin for pin in pins[name] if pin.marker is None or pin.marker.evaluate()]
         if requirement.marker is None or requirement.marker.evaluate():
             (pin,) = here
             (version,) = (specifier.version for specifier in pin.specifier)
@@ -96,5 +93,4 @@ def test_continuous_integration_covers_the_versions_that_are_stated():
 
 def test_issue_forms_have_what_their_reader_wants():
     for form in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml"):
-        document = yaml.safe_load(form.read_text("utf-8"))
-        assert {"name", "description", "body"} <= set(document)
+        assert {"name", "description", "body"} <= set(yaml.safe_load(form.read_text("utf-8")))

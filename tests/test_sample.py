@@ -15,22 +15,17 @@ from slatprep.sample import in_table, lacking, merge, sample
 NEAREST = SampleParameters(method="nearest")
 
 
-def _field() -> MaterialField:
-    """Two voxels with values of their own."""
+def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
     voxels = np.array([[10, 10, 10], [20, 10, 10]], dtype=np.uint8)
     values = np.array([[2e11, 7800, 0.3], [1e5, 1000, 0.45]], dtype=np.float32)
-    return MaterialField(occupancy_of(voxels), voxels, np.array([1, 4], np.uint8), values)
-
-
-def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
+    field = MaterialField(occupancy_of(voxels), voxels, np.array([1, 4], np.uint8), values)
     coords = np.array([[10, 10, 10], [13, 10, 10], [14, 10, 10], [18, 11, 10]], dtype=np.uint8)
     for parameters in (NEAREST, SampleParameters()):
-        found = sample(_field(), voxel_centres(coords), parameters)
+        found = sample(field, voxel_centres(coords), parameters)
         assert found.valid.tolist() == [True, True, False, True]
         assert found.material.tolist() == [1, 1, 255, 4]
         np.testing.assert_allclose(found.distance, [0, 3, 4, np.sqrt(5)], rtol=1e-6)
-        np.testing.assert_array_equal(found.properties[0], np.float32([2e11, 7800, 0.3]))
-        np.testing.assert_array_equal(found.properties[3], np.float32([1e5, 1000, 0.45]))
+        np.testing.assert_array_equal(found.properties[[0, 3]], values)
         assert np.isnan(found.properties[2]).all()
         assert found.properties.dtype == found.distance.dtype == np.float32
 
@@ -124,11 +119,7 @@ def test_what_an_annotation_does_not_know_is_left_to_the_others():
 
 
 def test_a_voxel_with_a_class_and_without_one_of_the_properties_is_not_valid():
-    one = _said([2, 2], [1e6, 1e6], [0.3, 0.3])
-    other = _said([2, 2], [1e6, 1e6], [0.3, 0.3])
-    for said in (one, other):
-        said.properties[1, 0] = np.nan
-    made = merge([one, other], PROPERTIES)
+    made = merge([_said([2, 2], [1e6, np.nan], [0.3, 0.3])] * 2, PROPERTIES)
     assert made.valid.tolist() == [True, False]
     assert made.material.tolist() == [2, UNANNOTATED]
     assert np.isnan(made.properties[1]).all()
@@ -145,8 +136,7 @@ def test_near_is_a_factor_of_two_and_a_fifth_of_the_mean():
         ((1e6, 1e6), (0.199, 0.301)),
     ):
         said = [_said([1], [e], [nu]) for e, nu in zip(modulus, ratio, strict=True)]
-        made = merge(said, PROPERTIES)
-        likely.append(float(made.confidence[0]))
+        likely.append(float(merge(said, PROPERTIES).confidence[0]))
     np.testing.assert_allclose(likely, [0.8, 0.4, 0.8, 0.4], rtol=1e-6)
 
 

@@ -109,8 +109,7 @@ def test_a_warp_from_the_nearest_similarity_is_the_same_map(bounds):
 
 def test_the_same_shape_is_not_deformed():
     field = field_of(chair())
-    latents = surface_latents(np.roll(chair(), (2, -1, 3), axis=(0, 1, 2)))
-    alignment = align(field, latents, DEFAULT)
+    alignment = align(field, surface_latents(np.roll(chair(), (2, -1, 3), axis=(0, 1, 2))), DEFAULT)
     assert (alignment.model, alignment.deformation) == ("rigid", None)
     assert alignment.figures.moved == alignment.figures.bending == 0.0
     assert np.isnan(alignment.figures.evidence_affine)  # too good to try
@@ -179,8 +178,7 @@ def test_a_model_that_is_asked_for_is_fitted_and_the_bound_holds():
     by_bending = np.linalg.norm(bending, axis=-1)
     farthest = max(by_affine.max(), by_bending.max()) * 64
     for limit in (farthest + 1.0, 0.5):
-        parameters = AlignParameters(model="deformable", max_displacement=limit)
-        bounded = align(field, latents, parameters)
+        bounded = align(field, latents, AlignParameters(model="deformable", max_displacement=limit))
         if bounded.deformation is None:  # its affine part alone moves too far
             assert bounded.model in ("rigid", "similarity")
             assert limit == 0.5
@@ -191,8 +189,7 @@ def test_a_model_that_is_asked_for_is_fitted_and_the_bound_holds():
 
 
 def test_a_finer_lattice_starts_as_the_same_warp():
-    warp = Warp(np.eye(3, 4), 0.0, np.zeros(3), 32.0, np.ones((5, 5, 5, 3)))
-    finer = halved(warp)
+    finer = halved(Warp(np.eye(3, 4), 0.0, np.zeros(3), 32.0, np.ones((5, 5, 5, 3))))
     assert finer.spacing == 16.0
     assert finer.coefficients.shape == (7, 7, 7, 3)
     assert finer.coefficients == pytest.approx(1.0)
@@ -288,8 +285,7 @@ def test_a_squashed_object_is_not_laid_on_its_side(factors, seed):
     rotation = Rotation.random(random_state=seed).as_matrix()
     other = crate(CENTRES @ rotation / factors)
     found = align_voxels(crate(CENTRES), other)
-    turn = degrees_between(split_transform(found.transform)[0], rotation)
-    assert turn < 15.0
+    assert degrees_between(split_transform(found.transform)[0], rotation) < 15.0
     as_similarity = align_voxels(crate(CENTRES), other, AlignParameters(model="similarity"))
     assert degrees_between(split_transform(as_similarity.transform)[0], rotation) > 60.0
 
@@ -301,8 +297,7 @@ def test_a_pose_that_would_be_squashed_flat_scores_nothing():
     flat = surface_of(block).subset(60)
     affines, poses = np.eye(3, 4)[None].copy(), Poses.of([Similarity(np.eye(3), np.zeros(3), 1.0)])
     affines[0, :, :3] *= 0.5
-    scores = stretch(flat.samples, flat.samples, poses, affines, np.array([5.0]))
-    assert scores[0] == 0.0
+    assert stretch(flat.samples, flat.samples, poses, affines, np.array([5.0]))[0] == 0.0
 
 
 def test_a_step_that_would_squash_it_flat_is_not_taken_nor_is_its_offset():

@@ -105,10 +105,8 @@ def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places():
     affines = np.eye(3, 4) + rng.normal(size=(6, 3, 4), scale=[0.1, 0.1, 0.1, 3.0])
     places = pair.places(poses, affines)
     points = pair.slat.points
-    there = [
-        looked_up(pose, points @ affine[:, :3].T + affine[:, 3])
-        for pose, affine in zip(poses, affines, strict=True)
-    ]
+    moved = (points @ affine[:, :3].T + affine[:, 3] for affine in affines)
+    there = [looked_up(pose, one) for pose, one in zip(poses, moved, strict=True)]
     expected = [rms(one, two) for one in there for two in there]
     apart = np.linalg.norm(places[:, None] - places, axis=2).ravel()
     np.testing.assert_allclose(apart, expected, rtol=1e-9, atol=1e-5)
@@ -117,9 +115,8 @@ def test_stretched_poses_are_apart_by_the_rms_distance_of_their_places():
 def test_a_repeated_placement_is_dropped_for_the_better_one():
     """What is dropped drops no other: the third lies near the second, and to none that is kept."""
     pair = pair_of(ball(12.0))
-    first, second, third = (
-        moved_by(x, 0.0, 0.0, score=score) for x, score in ((0, 0.9), (1.2, 0.8), (2.4, 0.7))
-    )
+    scores = {0.0: 0.9, 1.2: 0.8, 2.4: 0.7}
+    first, second, third = (moved_by(x, 0.0, 0.0, score=score) for x, score in scores.items())
     just = moved_by(0.0, DISTINCT, 0.0, score=0.6)
     within = moved_by(0.0, 0.0, DISTINCT - 0.01, score=0.5)
     assert pair.distinct([within, third, second, just, first]) == [first, third, just]
@@ -283,15 +280,12 @@ def test_deformed_places_are_apart_from_twice_the_usual_distance_on():
     """As a root mean square: half of the points may lie where they did."""
     points = np.random.default_rng(0).normal(size=(40, 3), scale=9.0)
     half = np.arange(40)[:, None] % 2
-    for shift, apart in (
-        ((-2 * DISTINCT, 0, 0), True), ((0, 2.9, 0), False), ((1.6, 1.8, -1.9), True),
-        ((-1.6, 1.6, 1.6), False),
-    ):  # fmt: skip
-        for better in (
-            [points + shift], [points + 99, points - shift], [points + 2**0.5 * half * shift],
-        ):  # fmt: skip
+    far, near = [(-2 * DISTINCT, 0, 0), (1.6, 1.8, -1.9)], [(0, 2.9, 0), (-1.6, 1.6, 1.6)]
+    for shift in (*far, *near):
+        half_moved = points + 2**0.5 * half * shift
+        for better in ([points + shift], [points + 99, points - shift], [half_moved]):
             every = list(range(len(better) + 1))
-            assert far_apart([*better, points]) == (every if apart else every[:-1])
+            assert far_apart([*better, points]) == (every if shift in far else every[:-1])
     assert far_apart([points, points, points + 99]) == [0, 2]
 
 
@@ -343,13 +337,10 @@ def test_what_fits_best_as_it_is_takes_part_if_stretching_finds_it_no_more(squas
     """Stretched, a neighbour of it fits better and stands for both."""
     pair, (best, *_) = squashed
     turns = Rotation.from_rotvec(0.04 * Rotation.random(20, random_state=6).as_rotvec()).as_matrix()
-    beside = [
-        replace(best, similarity=best.similarity._replace(rotation=turn @ best.similarity.rotation))
-        for turn in turns
-    ]
+    own = best.similarity
+    beside = [replace(best, similarity=own._replace(rotation=t @ own.rotation)) for t in turns]
     better = next(b for b in beside if search.stretched(pair, [best, b], [best]) == [b])
-    found = search.ranked(pair, [best, better], [best])
-    assert any(off(pair, pose, best) == 0.0 for pose in found)
+    assert any(off(pair, pose, best) == 0.0 for pose in search.ranked(pair, [best, better], [best]))
 
 
 def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squashed):
@@ -368,8 +359,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squ
 
 def test_of_many_placements_none_is_lost_or_doubled_where_few_are_contested(squashed):
     pair, poses = squashed
-    fine = pair.refine(poses, FINE._replace(size_by_slat=True))
-    many = pair.distinct(fine)
+    many = pair.distinct(pair.refine(poses, FINE._replace(size_by_slat=True)))
     assert len(many) > MOST_CONTESTED + 2
     found, _ = finish(pair, poses, rough=True)
     for pose in many[MOST_CONTESTED:]:

@@ -54,8 +54,7 @@ def test_the_common_rotation_is_found_among_others():
     assert degrees_between(consensus.rotation, COMMON) < 3.0
     assert np.linalg.det(consensus.rotation) == pytest.approx(1.0)
     shuffled = [transforms[i] for i in np.random.default_rng(0).permutation(20)]
-    again = consensus_of(shuffled)
-    assert again.rotation.tobytes() == consensus.rotation.tobytes()
+    assert consensus_of(shuffled).rotation.tobytes() == consensus.rotation.tobytes()
 
 
 def test_just_enough_is_enough():
@@ -131,8 +130,7 @@ def test_a_tie_goes_to_the_common_rotation_and_can_be_undone(boxed):
 
 def test_the_margin_of_a_placement_that_was_left_is_not_kept(boxed):
     _, latents, before = boxed
-    after = take(before, 0, latents, _agreeing(6))
-    assert not np.isnan(before.margin) and np.isnan(after.margin)
+    assert not np.isnan(before.margin) and np.isnan(take(before, 0, latents, _agreeing(6)).margin)
 
 
 def test_whichever_placement_came_first_the_same_one_is_chosen(boxed):
@@ -151,9 +149,7 @@ def test_whichever_placement_came_first_the_same_one_is_chosen(boxed):
 @pytest.mark.parametrize("gain", [-0.1, -0.02, 0.0, 0.03])
 @pytest.mark.parametrize(("score", "sharper"), [(0.3, 1), (0.9, 2), (0.999, 10), (np.nan, 1)])
 @pytest.mark.parametrize(("agree", "others"), [(5, 5), (19, 1), (400, 0)])
-def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
-    agree, others, score, sharper, gain
-):
+def test_odds_of_shapes_are_weighed_by_those_of_the_dataset(agree, others, score, sharper, gain):
     """By Bayes' rule: one more asset has any of the 23 other rotations, beside those counted."""
     consensus = _agreeing(agree, others)
     for number in (0, 22):
@@ -164,10 +160,9 @@ def test_the_odds_of_the_shapes_are_weighed_by_those_of_the_dataset(
         assert probability_of_common(consensus, gain, present) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("agree", "opposite", "taken"),
-    [(6, 4, 0.6), (5, 4, 0.55), (6, 5, 0), (5, 5, 0), (40, 0, 1), (40, 2, 0.95)],
-)
+@pytest.mark.parametrize(("agree", "opposite", "taken"), [
+    (6, 4, 0.6), (5, 4, 0.55), (6, 5, 0), (5, 5, 0), (40, 0, 1), (40, 2, 0.95),
+])  # fmt: skip
 def test_ties_of_a_dataset_of_two_frames_are_no_surer_than_its_counts(agree, opposite, taken):
     """Half a turn apart, both of a tie's placements are frames of the dataset."""
     half = np.diag([-1.0, -1.0, 1.0]) @ COMMON
@@ -181,8 +176,7 @@ def test_ties_of_a_dataset_of_two_frames_are_no_surer_than_its_counts(agree, opp
 def test_a_tie_that_fits_clearly_better_otherwise_stays_open():
     half = np.diag([-1.0, -1.0, 1.0]) @ COMMON
     tied = aligned(make_transform(half), make_transform(COMMON), score=0.99)
-    worse = replace(tied.placements[0], score=0.97)
-    tied = replace(tied, placements=(worse,))
+    tied = replace(tied, placements=(replace(tied.placements[0], score=0.97),))
     assert settle(tied, latents_of([[1, 2, 3]]), _agreeing(40)) is tied
 
 
@@ -229,18 +223,16 @@ def test_what_is_taken_is_fitted_as_aligning_would_fit_it(name, asked, model):
     assert found.model is model
     # As if another placement had been taken for the best.
     right = records.Placement(found.transform, found.score, 20.0)
-    other = replace(
-        found, transform=ELSEWHERE, deformation=None, figures=None, model=records.Model.RIGID,
-        placements=(right,),
-    )  # fmt: skip
+    stiff = {"deformation": None, "figures": None, "model": records.Model.RIGID}
+    other = replace(found, transform=ELSEWHERE, placements=(right,), **stiff)
     taken = take(other, 0, latents, BY)
     assert taken.deformation is None
     np.testing.assert_array_equal(taken.placements[0].transform, ELSEWHERE)
     assert taken.placements[0].displacement > 5
     settled = refit(taken, field, latents, parameters)
     assert (settled.model, settled.settled_by) == (model, BY)
-    stiff = model in (records.Model.RIGID, records.Model.SIMILARITY)
-    assert (settled.deformation is None) == stiff
+    undeformed = model in (records.Model.RIGID, records.Model.SIMILARITY)
+    assert (settled.deformation is None) == undeformed
     assert settled.quality == measure_quality(field, latents, settled.transform, parameters.radius)
     if asked == "auto":
         places = map_of(settled).places(latents.coords)

@@ -14,8 +14,7 @@ from slatprep.geometry.voxels import boundary, filled, voxels_of
 
 def test_a_shell_and_its_solid_have_the_same_surface():
     solid = chair()
-    shell = boundary(solid)
-    here, there = surface_of(shell), surface_of(solid)
+    here, there = surface_of(boundary(solid)), surface_of(solid)
     np.testing.assert_array_equal(here.distance, there.distance)
     np.testing.assert_array_equal(here.points, there.points)
     np.testing.assert_array_equal(here.boundary, there.boundary)
@@ -59,12 +58,6 @@ def test_the_size_is_the_mean_radius_wherever_a_ball_lies():
     ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 10**2
     aside = np.roll(ball, (15, -12, 9), axis=(0, 1, 2))
     assert surface_of(aside).size == surface_of(ball).size == pytest.approx(10, abs=0.2)
-
-
-def test_positions_are_counted_from_the_centre_of_the_cube():
-    middle = np.zeros((64, 64, 64), dtype=bool)
-    middle[20:44, 22:42, 30:34] = True  # as far from either end, so its centre is the cube's
-    np.testing.assert_allclose(surface_of(middle).centroid, 0.0, atol=1e-12)
 
 
 def test_the_boundary_is_that_of_the_filled_set():

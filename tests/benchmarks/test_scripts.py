@@ -36,8 +36,7 @@ def test_tables_of_the_page_are_two_cells_wide_and_none_is_empty():
     assert rows == [
         "| step | figures |", "| --- | --- |", "| build | files 3 |", "| read | CPU [s] 0.2 |",
     ]  # fmt: skip
-    text = (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
-    assert "null" not in text
+    assert "null" not in (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
 
 
 def test_every_measurement_names_a_script_and_a_page_that_are_there():
@@ -95,8 +94,7 @@ def test_engines_that_are_not_installed_are_left_out_and_named(demo, monkeypatch
     assert engines.installed_engines() == ("field",)
     # It compiles all kernels anew, twice: `make bench` does that.
     monkeypatch.setattr(engines, "_start_up", lambda engine: (1.0, 9.0))
-    arguments = ["--data", str(demo), "--repeats", "1"]
-    result = CliRunner().invoke(engines.main, arguments)
+    result = CliRunner().invoke(engines.main, ["--data", str(demo), "--repeats", "1"])
     assert result.exit_code == 0, result.output
     assert "field" in result.stdout
     for engine in engines.ENGINES[1:]:

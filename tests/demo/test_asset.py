@@ -98,9 +98,8 @@ def test_labels_are_those_at_the_true_places(index, level, least, near):
 def test_properties_follow_the_material_and_stay_in_the_published_span(index):
     made = asset(index, 1)
     view = made.views[0]
-    for material, (modulus, density, poisson) in zip(
-        view.material[::97], view.properties[::97], strict=True
-    ):
+    some = zip(view.material[::97], view.properties[::97], strict=True)
+    for material, (modulus, density, poisson) in some:
         assert any(
             cls == material
             and e[0] * 0.99 <= modulus <= e[1] * 1.01
@@ -190,10 +189,9 @@ def test_views_turn_the_slat_side_about_z():
 
 
 def test_habitual_share_gives_most_assets_one_quarter_turn():
-    turns = [
-        make_asset(4, 20 + 14 * 3 * k, levels=(0,), habitual_share=0.8).views[0].transform[:3, :3]
-        for k in range(20)
-    ]
+    numbers = range(20, 20 + 14 * 3 * 20, 14 * 3)
+    made = (make_asset(4, k, levels=(0,), habitual_share=0.8) for k in numbers)
+    turns = [one.views[0].transform[:3, :3] for one in made]
     counts = np.unique(np.rint(turns).reshape(20, 9), axis=0, return_counts=True)[1]
     assert 12 <= counts.max() <= 19
 
@@ -221,8 +219,6 @@ def test_every_category_has_a_builder_and_every_object_an_id():
     assert len(set(ids)) == 200
     assert all(len(i) == 32 and set(i) <= set("0123456789abcdef") for i in ids)
 
-
-# -- shapes that differ
 
 CUBE = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
 
@@ -269,15 +265,12 @@ def test_places_are_where_the_maps_inverted_by_numbers_put_them():
     skin = rng.uniform(*solid.extent, (500, 3))
     frames = generate(rng, frames, LEVELS[5].bend, solid, skin)
     shape, slat = frames.distortion, frames.slat
-    waves = shape.waves
+    waves = shape.waves.amplitude, shape.waves.wave, shape.waves.phase
 
     def object_of(y):
         q = (y - shape.middle) / shape.size
         growth = 1.0 + np.tanh(4.0 * (shape.away @ q)) / 3.0
-        bend = sum(
-            a * np.sin(k @ q + p)
-            for a, k, p in zip(waves.amplitude, waves.wave, waves.phase, strict=True)
-        )
+        bend = sum(a * np.sin(k @ q + p) for a, k, p in zip(*waves, strict=True))
         return shape.middle + shape.size * (q + growth * bend) / shape.proportions
 
     def placed(pose, there):
@@ -376,8 +369,6 @@ def test_a_nerf_field_loses_some_thin_parts_but_never_the_object():
     field = nerf_field(np.random.default_rng(0), only_thin, np.array([0.0, 0.0, 1.0]), 1)
     assert ((field == 0) & (only_thin == 0)).sum() > 0.6 * (only_thin == 0).sum()
 
-
-# -- shapes and their voxels
 
 SHAPES = {
     "sphere": shapes.sphere((0.1, 0.0, -0.1), 0.3),

@@ -10,11 +10,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "design" / "architecture.md").read_text("utf-8")
+TOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]
 LAYERS = [
     {room.strip() for room in layer.split("|")}
-    for layer in tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"][
-        "importlinter"
-    ]["contracts"][0]["layers"]
+    for layer in TOOLS["importlinter"]["contracts"][0]["layers"]
 ]
 NAMES = sorted(set(re.findall(r"`(slatprep(?:\.\w+)+)`", PAGE)))
 PATHS = sorted(set(re.findall(r"`((?:slatprep|tests|docs)/[\w/.]*|[\w.]+\.(?:toml|yml))`", PAGE)))
@@ -34,8 +33,7 @@ def test_every_name_and_path_exists():
 
 def test_every_room_has_its_line():
     section = PAGE.split("## The rooms")[1].split("\n## ")[0]
-    told = set(re.findall(r"`slatprep/(\w+)(?:/|\.py)`", section))
-    assert told == set().union(*LAYERS)
+    assert set(re.findall(r"`slatprep/(\w+)(?:/|\.py)`", section)) == set().union(*LAYERS)
 
 
 def test_the_picture_has_the_floors_that_are_checked():

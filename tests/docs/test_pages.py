@@ -106,9 +106,6 @@ def test_a_long_equation_scrolls_by_itself() -> None:
     assert inline.startswith("<math")
 
 
-# -- messages ---------------------------------------------------------------
-
-
 def templates() -> list[str]:
     """Return every text of the source, with … for what is filled in."""
     found = []
@@ -139,16 +136,10 @@ def test_messages_of_troubleshooting_are_those_of_the_source():
         assert any(map(pattern.search, said)), message
 
 
-# -- the shell --------------------------------------------------------------
-
-
-def complete(words: str, shell: str = "bash_complete") -> str:
+def complete(words: str) -> str:
     """Return what the entry answers to a shell that asks."""
-    asked = {
-        "_SLATPREP_COMPLETE": shell,
-        "COMP_WORDS": words,
-        "COMP_CWORD": str(len(words.split()) - 1),
-    }
+    last = str(len(words.split()) - 1)
+    asked = {"_SLATPREP_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": last}
     result = CliRunner().invoke(slatprep, env=asked, prog_name="slatprep")
     assert result.exit_code == 0, result.output
     return result.stdout
@@ -166,8 +157,7 @@ def test_commands_options_and_values_complete():
     done = subprocess.run(entry, capture_output=True, text=True, env=os.environ | asked)
     assert "Traceback" not in done.stderr, done.stderr
     assert done.stdout.splitlines() == ["plain,export"]
-    offered = complete("slatprep export x --format w").splitlines()
-    assert offered == ["plain,webdataset"]
+    assert complete("slatprep export x --format w").splitlines() == ["plain,webdataset"]
     assert "plain,--verdict" in complete("slatprep export x --verd").splitlines()
 
 
@@ -218,8 +208,7 @@ def test_links_between_files_lead_somewhere(page):
 
 def test_configuration_lists_every_key_with_its_default():
     text = (ROOT / "docs" / "configuration.md").read_text("utf-8")
-    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| ", text, re.M)
-    documented = iter(rows)
+    documented = iter(re.findall(r"^\| `(\w+)` \| (.+?) \| ", text, re.M))
     hints = get_type_hints(BuildParameters)
     assert next(documented) == ("name", '`""`')
     for group in dataclasses.fields(BuildParameters):
@@ -248,8 +237,7 @@ def test_two_folders_are_read_by_the_definition_that_is_shown(tmp_path):
     opened = open_store(store)
     assert opened.ids == ["first-cup", "second-cup"]
     assert [(one.lo, one.hi) for one in opened.normalization.ranges] == [(3, 12), (1, 4), (0, 0.5)]
-    roles = {source.role for source in StoredRecords(opened).of("second-cup").sources}
-    assert "mask" in roles
+    assert "mask" in {source.role for source in StoredRecords(opened).of("second-cup").sources}
 
 
 def default_of(field: dataclasses.Field[object]) -> str:

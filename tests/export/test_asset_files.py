@@ -1,7 +1,6 @@
 """Files of an asset are read as their users read them: TRELLIS's data set, VoMP, Pixie, Open3D."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -62,10 +61,8 @@ def test_the_targets_lie_beside_the_latents(store, mixed, tmp_path):
     export_store(open_store(store), tmp_path / "root", "npz")
     for asset_id, asset in mixed.assets.items():
         with np.load(tmp_path / "root" / "latents" / ENCODER / f"{asset_id}.npz") as data:
-            assert sorted(data) == [
-                "classes", "columns", "confidence", "coords", "feats", "material", "properties",
-                "ranges", "valid",
-            ]  # fmt: skip
+            names = "classes columns confidence coords feats material properties ranges valid"
+            assert sorted(data) == names.split()
             np.testing.assert_array_equal(data["coords"], asset.coords)
             np.testing.assert_array_equal(data["feats"], asset.feats)
             assert data["coords"].dtype == np.uint8 and data["feats"].dtype == np.float32
@@ -138,23 +135,21 @@ def load_materials(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return where, np.stack(what, axis=1)
 
 
-def test_names_of_classes_are_not_cut(store, tmp_path):
-    other = Path(shutil.copytree(store, tmp_path / "s.zarr"))
+def test_names_of_classes_are_not_cut(copy, tmp_path):
     names = [f"{'wood that is hard ' * 3}{k}" for k in range(7)]
-    edit_attributes(other, material_classes=names)
-    export_store(other, tmp_path / "vomp", "voxel_data", assets=["cup"])
+    edit_attributes(copy, material_classes=names)
+    export_store(copy, tmp_path / "vomp", "voxel_data", assets=["cup"])
     (path,) = (tmp_path / "vomp").rglob("*.npz")
-    asset = open_store(other)["cup"]
+    asset = open_store(copy)["cup"]
     written = np.load(path)["voxel_data"]["segment_id"]
     np.testing.assert_array_equal(written, np.array(names)[asset.material[asset.valid]])
 
 
-def test_classes_that_physgaussian_does_not_have_are_no_material_id(store, tmp_path):
-    other = Path(shutil.copytree(store, tmp_path / "s.zarr"))
-    edit_attributes(other, material_classes=["oak", *"bcdefg"])
-    export_store(other, tmp_path / "ply", "ply", assets=["cup"])
+def test_classes_that_physgaussian_does_not_have_are_no_material_id(copy, tmp_path):
+    edit_attributes(copy, material_classes=["oak", *"bcdefg"])
+    export_store(copy, tmp_path / "ply", "ply", assets=["cup"])
     (path,) = (tmp_path / "ply").rglob("*.ply")
-    read, asset = plyfile.PlyData.read(path), open_store(other)["cup"]
+    read, asset = plyfile.PlyData.read(path), open_store(copy)["cup"]
     assert (read["vertex"]["material_id"] == -1).all()
     np.testing.assert_array_equal(read["vertex"]["part_label"], asset.material[asset.valid])
     assert {"part_label 0 is oak", "part_label 1 is b"} <= set(read.comments)
@@ -214,9 +209,6 @@ def test_points_may_be_chosen_for_voxel_data_and_the_frame_may_not(store, tmp_pa
     export_store(store, tmp_path / "o", "voxel_data", assets=["cup"], options=options)
 
 
-# -- PLY -------------------------------------------------------------------------
-
-
 # As `map_pred_to_coords.py` of Pixie declares the rows of its files.
 PIXIE_VERTEX = [
     *((axis, "f4") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue", "alpha")),
@@ -259,10 +251,8 @@ def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path
         done = export_store(store, tmp_path / frame, "ply", options=options)
     assert "5 assets have no world bounds" in done.notes[0]
     assert json.loads((tmp_path / frame / "index.json").read_text())["notes"] == list(done.notes)
-    world, slat = (
-        plyfile.PlyData.read(tmp_path / frame / "cup.ply")["vertex"]
-        for frame in ("pixieverse", "slat")
-    )
+    files = (tmp_path / frame / "cup.ply" for frame in ("pixieverse", "slat"))
+    world, slat = (plyfile.PlyData.read(file)["vertex"] for file in files)
     # Where Pixie's `map_pred_to_coords.py` puts voxels of a field without bounds of its own.
     expected = np.linspace(-0.5, 0.5, 64)[voxels]
     turned = ((voxels + 0.5) / 64 - 0.5) @ QUARTER_TURN[:3, :3].T
@@ -277,14 +267,11 @@ def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path
 def test_world_bounds_of_the_records_are_used(make_dataset: MakeDataset, tmp_path):
     dataset = make_dataset("cup")
     lo, hi = np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 7.0])
-    np.savez(
-        tmp_path / "sources" / "pixieverse" / "cup" / "clip_features.npz",
-        min_bounds=lo, max_bounds=hi, grid_shape=(64, 64, 64),
-    )  # fmt: skip
+    file = tmp_path / "sources" / "pixieverse" / "cup" / "clip_features.npz"
+    np.savez(file, min_bounds=lo, max_bounds=hi, grid_shape=(64, 64, 64))
     summary = build_store(dataset.parameters(), tmp_path / "s.zarr")
     options = ExportOptions(points="grid", frame="pixieverse")
-    done = export_store(summary.store, tmp_path / "ply", "ply", options=options)
-    assert done.notes == ()
+    assert export_store(summary.store, tmp_path / "ply", "ply", options=options).notes == ()
     vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
     voxels = np.argwhere(dataset.assets["cup"].grid[..., 3] != 7)
     expected = np.take_along_axis(np.linspace(lo, hi, 64), voxels, axis=0)

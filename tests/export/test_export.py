@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -37,8 +38,6 @@ from slatprep.store import Store, open_store
 
 KINDS = ("hdf5", "npz")
 """A format of one file, and one of a folder."""
-
-# -- HDF5, WebDataset --------------------------------------------------
 
 
 def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
@@ -111,19 +110,13 @@ def test_shards_are_read_by_webdataset(store, mixed, tmp_path):
         np.testing.assert_allclose(sample["json"]["transform"], QUARTER_TURN, atol=2e-3)
 
 
-# -- all of them ------------------------------------------------------------
-
-
 @pytest.mark.parametrize("format", FORMATS)
 def test_bytes_repeat_whatever_the_jobs(format, store, tmp_path):
     options = ExportOptions(shard_size=2)
     progress: list[tuple[int, int]] = []
     for name, jobs in (("one", 1), ("two", 2)):
-        out = tmp_path / name / "export"
-        export_store(
-            store, out, format, options=options, jobs=jobs,
-            progress=lambda done, total: progress.append((done, total)),
-        )  # fmt: skip
+        how = {"options": options, "jobs": jobs, "progress": lambda *at: progress.append(at)}
+        export_store(store, tmp_path / name / "export", format, **how)
         assert progress[-1] == (5, 5)
     one, two = bytes_of(tmp_path / "one" / "export"), bytes_of(tmp_path / "two" / "export")
     assert one == two and len(one) >= 1
@@ -275,8 +268,7 @@ def test_a_disk_that_is_full_ends_no_process(format, store, tmp_path):
         "    except SlatprepError as error: print(error, os.listdir(sys.argv[2]))\n"
     )
     command = [sys.executable, "-c", code, str(store), str(tmp_path), format]
-    told = subprocess.run(command, capture_output=True, text=True, check=True)
-    lines = told.stdout.splitlines()
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert len(lines) == 4
     for line in lines:
         assert f"cannot be written to {tmp_path} (File too large); nothing was replaced" in line
@@ -298,10 +290,7 @@ def test_a_link_stays_and_a_failed_export_leaves_the_old_one(format, store, tmp_
         export_store(store, store / "voxel" / "export", format)
     assert not (store / "voxel" / "export").exists()
 
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Store, "asset", fail)
+    monkeypatch.setattr(Store, "asset", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(SlatprepError, match=r"cannot be written to .* \(No space left"):
         export_store(store, fresh, format)
     assert bytes_of(fresh) == before
@@ -387,9 +376,6 @@ def test_hostile_ids_stay_inside_every_export(format, copy, tmp_path):
         with tarfile.open(next(out.glob("*.tar"))) as tar:
             assert all("/" not in name for name in tar.getnames())
         assert {sample["json"]["asset_id"] for sample in samples_of(out)} == set(names)
-
-
-# -- killed exports --------------------------------------------------------
 
 
 def test_an_export_removes_what_a_killed_one_left_and_nothing_else(tmp_path):

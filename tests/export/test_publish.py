@@ -163,10 +163,8 @@ def from_hub(hub: str, code: str, tmp_path: Path) -> Any:
     """Run code in a new process, whose hub this one is, and return what it printed last."""
     none = dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"), "")
     home = {"HF_ENDPOINT": hub, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True, text=True, env=os.environ | none | home, check=False,
-    )  # fmt: skip
+    command, variables = [sys.executable, "-c", code], os.environ | none | home
+    done = subprocess.run(command, capture_output=True, text=True, env=variables)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -228,8 +226,7 @@ def test_croissant_is_valid_without_a_warning(store, tmp_path, caplog):
     assert dataset.metadata.ctx.issues.report() == ""
     assert caplog.text == ""
     assert dataset.metadata.name == store.stem
-    sets = {node.id for node in dataset.metadata.distribution}
-    assert sets >= {layout.name for layout in ARRAYS}
+    assert {node.id for node in dataset.metadata.distribution} >= {layout.name for layout in ARRAYS}
 
 
 def test_croissant_s_records_are_the_store_s(store, tmp_path):

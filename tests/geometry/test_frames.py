@@ -74,9 +74,7 @@ def test_inverses_and_parts_of_a_transform(transform):
     np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
 
 
-NO_TRANSFORMS = [
-    np.eye(3), make_transform(np.eye(3), (1, 2, 3)).T, np.diag([1.0, 1.0, 1.0, 2.0]),
-]  # fmt: skip
+NO_TRANSFORMS = [np.eye(3), make_transform(np.eye(3), (1, 2, 3)).T, np.diag([1.0, 1, 1, 2])]
 NO_SIMILARITIES = [
     np.diag([1.0, 1.0, -1.0, 1.0]),  # a mirror
     np.diag([1.0, 1.0, 0.0, 1.0]),  # flat
@@ -105,8 +103,7 @@ def test_of_mirrored_points_the_nearest_similarity_is_no_mirror():
 
 @given(st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=50))
 def test_voxels_and_occupancy_are_two_forms_of_one_set(voxels):
-    occupancy = occupancy_of(np.array(sorted(voxels)))
-    assert {tuple(v) for v in voxels_of(occupancy).tolist()} == voxels
+    assert {tuple(v) for v in voxels_of(occupancy_of(np.array(sorted(voxels)))).tolist()} == voxels
 
 
 def test_displacement_by_hand():
@@ -222,8 +219,8 @@ def made_of(affine: np.ndarray, coefficients: np.ndarray = NO_BENDING, points: n
     return make_deformation(affine, [-0.5] * 3, 0.25, coefficients, points, most)
 
 
-def points(count: int = 500, reach: float = 0.55, seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
+def points(count: int = 500, reach: float = 0.55) -> np.ndarray:
+    return np.random.default_rng(1).uniform(-reach, reach, (count, 3))
 
 
 def test_a_spline_is_the_sum_of_its_basis_functions():
@@ -246,8 +243,7 @@ def test_a_point_goes_there_and_back():
     for deformation in (None, made_of(AFFINE), bent()):
         way = PlaceMap(transform, deformation)
         x = points(reach=0.6)
-        back = way.to_slat(way.to_pixieverse(x))
-        assert np.abs(back - x).max() * 64 < 1e-3
+        assert np.abs(way.to_slat(way.to_pixieverse(x)) - x).max() * 64 < 1e-3
         for wrong in ([0.1, 0.2, 0.3], np.zeros((2, 2, 3)), np.zeros((2, 4))):
             for method in (way.to_slat, way.to_pixieverse, way.volume_ratios):
                 with pytest.raises(ValueError, match=r"have shape .*; expected \(N, 3\)"):
@@ -293,16 +289,14 @@ def test_how_much_bending_is_certain_not_to_fold_by_hand():
     limits = {steps: brentq(room, 0.0, 0.2, args=(steps,)) for steps in (2, 4)}
     assert limits[2] < limits[4]
     for height, proper in ((0.999 * limits[4], True), (1.001 * limits[4], False)):
-        made = Deformation(IDENTITY, np.full(3, -0.5), spacing, height * unit)
-        assert is_proper(made) is proper
+        assert is_proper(Deformation(IDENTITY, np.full(3, -0.5), spacing, height * unit)) is proper
 
 
 def test_bending_is_shortened_to_the_bound_and_not_further():
     for voxels, expected in ((10.0, 10.0), (20.0, 16.0)):
         coefficients = np.zeros((7, 7, 7, 3))
         coefficients[..., 2] = voxels / 64  # everything moves alike, so nothing bends
-        made = made_of(IDENTITY, coefficients)
-        length = np.linalg.norm(made.coefficients, axis=-1) * 64
+        length = np.linalg.norm(made_of(IDENTITY, coefficients).coefficients, axis=-1) * 64
         np.testing.assert_allclose(length, expected, rtol=1e-5)
         assert length.max() <= expected + 64 * GRAIN
 

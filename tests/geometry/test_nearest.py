@@ -131,8 +131,7 @@ def test_each_vote_is_of_its_own_labels():
     point = voxel_centres([[30.4, 20, 20]])
     held = VoxelIndex(voxels)
     for labels, winner in (([0] * 4, 0), ([2, 5, 5, 5], 1), ([0] * 4, 0)):
-        voted = held.voted(point, np.array(labels, np.uint8), 1.0, 2.0)[1]
-        assert voted.tolist() == [winner]
+        assert held.voted(point, np.array(labels, np.uint8), 1.0, 2.0)[1].tolist() == [winner]
 
 
 def test_of_a_drawn_vote_the_lower_label_wins():
@@ -199,20 +198,17 @@ def test_too_large_a_box_and_too_long_a_line_are_refused():
         outside_of(np.zeros((2, 2, 65), dtype=bool))
 
 
-def _outside(occupancy: np.ndarray) -> np.ndarray:
-    regions, _ = ndimage.label(~np.pad(occupancy, 1))
-    return (regions == regions[0, 0, 0])[1:-1, 1:-1, 1:-1]
-
-
 @given(
     st.tuples(*[st.integers(1, 9)] * 2, st.integers(1, 64)),
     st.sampled_from([0.0, 0.3, 0.6, 0.7, 1.0]),
     SEEDS,
 )
 @settings(max_examples=100)
-def test_any_set(shape, share, seed):
+def test_what_is_outside_of_any_set_is_scipy_s_region_of_a_corner(shape, share, seed):
     occupancy = np.random.default_rng(seed).random(shape) < share
-    np.testing.assert_array_equal(outside_of(occupancy), _outside(occupancy))
+    regions, _ = ndimage.label(~np.pad(occupancy, 1))
+    outside = (regions == regions[0, 0, 0])[1:-1, 1:-1, 1:-1]
+    np.testing.assert_array_equal(outside_of(occupancy), outside)
 
 
 def test_a_flood_follows_a_winding_passage_back_and_forth():

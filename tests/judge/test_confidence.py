@@ -10,6 +10,7 @@ from scipy.special import expit
 from support.demos import Case, made_cases
 from support.shapes import GRID, chair, field_of, surface_latents
 
+from slatprep import records
 from slatprep.align import align
 from slatprep.align.figures import measure_figures
 from slatprep.inspect.verify.assets import roundings
@@ -27,14 +28,7 @@ from slatprep.normalize import (
 )
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.pipeline.annotate import look_up
-from slatprep.records import (
-    Alignment,
-    Annotation,
-    Judgement,
-    MaterialField,
-    StructuredLatents,
-    Verdict,
-)
+from slatprep.records import Alignment, MaterialField, StructuredLatents, Verdict
 from slatprep.sample import sample
 
 OF_PLACEMENT = ("margin", "clear_by", "ties", "alike")
@@ -78,9 +72,8 @@ def apart(figures: np.ndarray) -> list[str]:
 
 
 def rated(targets: np.ndarray, decoys: np.ndarray) -> ErrorRates:
-    found = error_rates(
-        targets, decoys, apart(targets), apart(decoys), **called_good(targets, decoys)
-    )
+    good = called_good(targets, decoys)
+    found = error_rates(targets, decoys, apart(targets), apart(decoys), **good)
     # Errors never rise with the score.
     order = np.argsort(found.scores)
     assert (np.diff(found.errors[order]) <= 1e-12).all()
@@ -149,9 +142,8 @@ def test_the_interval_holds_the_true_share_where_whole_objects_are_wrong():
         targets = right(224, seed)
         targets[bad] = wrong(224, seed + 1000)[bad]
         decoys = wrong(112, seed + 2000)
-        found = error_rates(
-            targets, decoys, names, names[::2], **called_good(targets, decoys), seed=seed
-        )
+        good = called_good(targets, decoys)
+        found = error_rates(targets, decoys, names, names[::2], **good, seed=seed)
         assert not found.refitted
         held.append(found.wrong_share_range[0] <= 0.2 <= found.wrong_share_range[1])
     assert np.mean(held) > 0.9
@@ -188,9 +180,8 @@ def test_the_order_of_assets_does_not_matter():
     names, good = np.array(apart(targets)), called_good(targets, decoys)
     first = error_rates(targets, decoys, names, apart(decoys), **good)
     order = np.random.default_rng(0).permutation(len(targets))
-    second = error_rates(
-        targets[order], decoys, names[order], apart(decoys), **good | {"good": good["good"][order]}
-    )
+    good["good"] = good["good"][order]
+    second = error_rates(targets[order], decoys, names[order], apart(decoys), **good)
     np.testing.assert_allclose(second.errors, first.errors[order], atol=1e-6)
     assert second.wrong_share == pytest.approx(first.wrong_share)
 
@@ -204,8 +195,8 @@ def test_a_dataset_that_the_shipped_model_finds_rough_is_set_right_by_its_decoys
     assert found.wrong_share < 0.05
 
 
-Judged = tuple[Judgement, Annotation, Alignment]
-OfAChair = tuple[MaterialField, StructuredLatents, Alignment, Annotation]
+Judged = tuple[records.Judgement, records.Annotation, Alignment]
+OfAChair = tuple[MaterialField, StructuredLatents, Alignment, records.Annotation]
 
 SPEAK_FOR = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2",
              "within_3", "margin", "clear_by", "fitness", "fitness_backward", "valid_share",
@@ -314,8 +305,7 @@ def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(of_a
 
 
 def test_own_objects_pass_and_other_objects_fail(cases, judged):
-    confidences = [judgement.confidence for judgement, _, _ in judged]
-    assert np.median(confidences) > 0.9
+    assert np.median([judgement.confidence for judgement, _, _ in judged]) > 0.9
     assert sum(judgement.verdict is Verdict.FAILED for judgement, _, _ in judged) <= 1
     for k, (field, _, truth) in enumerate(cases):
         _, latents, other = cases[(k + 3) % len(cases)]

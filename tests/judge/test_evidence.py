@@ -10,6 +10,7 @@ from support.shapes import GRID, aligned, annotated, field_of, latents_of, surfa
 from slatprep import records
 from slatprep.align.figures import measure_figures
 from slatprep.geometry.frames import make_transform
+from slatprep.geometry.voxels import occupancy_of
 from slatprep.judge.confidence import class_confidence, voxel_figures
 from slatprep.judge.evidence import (
     FIGURES,
@@ -114,8 +115,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
     tower = np.zeros((64, 64, 64), dtype=bool)
     tower[20:44, 20:44] = True
     field = field_of(tower, np.where(GRID[..., 2] < 32, 1, 3))
-    voxels = np.array([[32, 32, 31], [32, 32, 29], [32, 32, 10], [32, 32, 1]])
-    latents = latents_of(voxels)
+    latents = latents_of(np.array([[32, 32, 31], [32, 32, 29], [32, 32, 10], [32, 32, 1]]))
     annotation = annotated(np.array([1, 1, 1, 255]), latents.centres)
     around = surroundings_of(field, latents, fitted(), annotation)
     # Of 14 cells one and four lie above: 1, 2, 4, 7 voxels along the axis, 1, 1, 2, 4 diagonally.
@@ -191,12 +191,9 @@ def test_rounding_beside_what_counts_as_the_same_decides_whether_labels_of_ties_
 def plain_field(values: np.ndarray) -> records.MaterialField:
     """Return a field without classes, of voxels (K, P) of properties that are not mapped."""
     voxels = np.argwhere(np.ones((64, 64, 64), dtype=bool))[: len(values)].astype(np.uint8)
-    solid = np.zeros((64, 64, 64), dtype=bool)
-    solid[tuple(voxels.T)] = True
     table = tuple(records.Property(f"p{k}", "1", False) for k in range(values.shape[1]))
-    nothing = np.zeros(len(values), np.uint8)
-    values = values.astype(np.float32)
-    return records.MaterialField(solid, voxels, nothing, values, table=table, classified=False)
+    given = occupancy_of(voxels), voxels, np.zeros(len(values), np.uint8), values.astype(np.float32)
+    return records.MaterialField(*given, table=table, classified=False)
 
 
 def as_annotation(field: records.MaterialField, rows: np.ndarray) -> records.Annotation:
@@ -209,12 +206,10 @@ def as_annotation(field: records.MaterialField, rows: np.ndarray) -> records.Ann
 def test_labels_without_classes_are_the_nearest_tenths_or_coarser(properties, parts):
     # Eleven tenths to the power of 1, 2 and 3 are 11, 121 and 1331; six fifths are 216 at the
     # third, 1296 at the fourth; and the three steps of 0, 0.4 and 0.8 are 81.
-    rng = np.random.default_rng(0)
-    values = rng.random((3000, properties))
+    values = np.random.default_rng(0).random((3000, properties))
     values[:2] = [[0.0], [1.0]]
     field = plain_field(5.0 + 3.0 * values)
-    rows = np.array([4, -1, 0, 77])
-    cells, own = _labels_of(field, as_annotation(field, rows))
+    cells, own = _labels_of(field, as_annotation(field, np.array([4, -1, 0, 77])))
     _, expected = np.unique(np.rint(values * parts), axis=0, return_inverse=True)
     pairs = set(zip(cells.tolist(), expected.reshape(-1).tolist(), strict=True))
     assert len(pairs) == len({label for label, _ in pairs}) == expected.max() + 1
@@ -235,8 +230,7 @@ def test_labels_are_made_coarser_where_255_are_too_few():
 
 def test_no_label_is_that_of_nothing_however_many_combinations_there_are():
     # Nine properties that are either 0 or 1 have 512 combinations, however coarse.
-    values = np.argwhere(np.ones((2,) * 9, dtype=bool)).astype(float)
-    field = plain_field(values)
+    field = plain_field(np.argwhere(np.ones((2,) * 9, dtype=bool)).astype(float))
     cells, own = _labels_of(field, as_annotation(field, np.arange(512)))
     np.testing.assert_array_equal(cells, np.minimum(np.arange(512), 254))
     np.testing.assert_array_equal(own, cells)
@@ -312,9 +306,8 @@ def test_figures_of_a_voxel_by_hand():
     around = Surroundings(others, solid, *of_voxels)
     doubt, rough = -math.log(0.8 / 0.2), 0.2  # depths of -0.25 and 0.15 lie 0.2 about their mean
     by_hand = (others.tolist(), (5.0, 1.0), (0.25, 0.15), (0.5, 2.5))
-    for values, shares, distance, depth, moved in zip(
-        voxel_figures(around, 0.8).tolist(), *by_hand, strict=True
-    ):
+    found = voxel_figures(around, 0.8).tolist()
+    for values, shares, distance, depth, moved in zip(found, *by_hand, strict=True):
         row = dict(zip(VOXEL_FIGURES, values, strict=True))
         expected = {"distance": distance, "depth": depth, "moved": moved}
         expected |= {"asset_unsure": doubt, "asset_rough": rough}

@@ -41,8 +41,8 @@ def ids_of(part: int, number: int) -> list[str]:
     return [name for name in map(str, range(99)) if fold_of(name) == part][:number]
 
 
-def a_model(seed: int = 0) -> LatentModel:
-    rng = np.random.default_rng(seed)
+def a_model() -> LatentModel:
+    rng = np.random.default_rng(0)
     root = rng.normal(size=(8, 8))
     shares = np.array([0.3, 0.1, 0.2, 0.0, 0.25, 0.1, 0.05])
     return LatentModel(rng.normal(size=(7, 8)), root @ root.T + np.eye(8), shares)
@@ -99,16 +99,14 @@ def test_a_model_has_the_moments_of_the_classes_about_their_means():
 
 
 def test_two_classes_in_two_parts_are_enough_for_models_and_less_is_not():
-    rng = np.random.default_rng(2)
-    feats = rng.normal(size=(40, 8)).astype(np.float32)
+    feats = np.random.default_rng(2).normal(size=(40, 8)).astype(np.float32)
     two, one = np.repeat([1, 4], 20).astype(np.uint8), np.full(40, 4, dtype=np.uint8)
     here, there = ids_of(0, 1), ids_of(1, 1)
     assert fit_models((name, moments_of(feats, two)) for name in here + there) is not None
     assert fit_models((name, moments_of(feats, two)) for name in ids_of(0, 4)) is None
     assert fit_models([]) is None
-    assert (
-        fit_models([(here[0], moments_of(feats, two)), (there[0], moments_of(feats, one))]) is None
-    )
+    differ = [(here[0], moments_of(feats, two)), (there[0], moments_of(feats, one))]
+    assert fit_models(differ) is None
 
 
 def test_likelihoods_and_gain_are_those_of_gaussians():
@@ -139,8 +137,7 @@ def box(classes: str) -> tuple[MaterialField, StructuredLatents, NDArray[np.uint
     by = {"levels": upper[..., 2], "octants": upper @ [1, 2, 4] % 7}[classes]
     material = by.astype(np.uint8)
     coords = voxels_of(boundary(solid))
-    rng = np.random.default_rng(4)
-    feats = rng.normal(size=(len(coords), 8)).astype(np.float32)
+    feats = np.random.default_rng(4).normal(size=(len(coords), 8)).astype(np.float32)
     labels = material[tuple(coords.T.astype(int))]
     labels[(coords[:, 2] >= TOP) | (coords[:, 0] % 5 == 0)] = UNANNOTATED
     annotated = solid & (GRID[..., 2] < TOP)
@@ -149,8 +146,7 @@ def box(classes: str) -> tuple[MaterialField, StructuredLatents, NDArray[np.uint
 
 
 def class_at(field: MaterialField) -> dict[tuple[int, ...], int]:
-    voxels = map(tuple, field.voxels.tolist())
-    return dict(zip(voxels, field.material.tolist(), strict=True))
+    return dict(zip(map(tuple, field.voxels.tolist()), field.material.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(("classes", "axes"), [("levels", [0, 1]), ("octants", [0, 1, 2])])
@@ -188,10 +184,8 @@ def test_of_placements_the_voxels_count_that_have_a_class_under_all():
     model, there = a_model(), class_at(field)
     likely = model.log_likelihood(latents.feats)
     over = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix())
-    found = weigh(
-        field, latents, aligned(np.eye(4), over), labels, model,
-        SampleParameters(method="nearest", max_distance=2.0),
-    )  # fmt: skip
+    parameters = SampleParameters(method="nearest", max_distance=2.0)
+    found = weigh(field, latents, aligned(np.eye(4), over), labels, model, parameters)
     support, differing, voxels = np.zeros(2), 0, 0
     for row, (x, y, z) in enumerate(latents.coords.astype(int).tolist()):
         if max(z, 63 - z) > TOP - 1 + 2:
@@ -230,12 +224,8 @@ def test_a_turn_that_changes_few_classes_is_left_out():
         rim = (GRID[..., 2] < end) | (abs(GRID - [LOW[0], LOW[1], 30]) < 1).all(axis=-1)
         field = field_of(solid, rim)
         labels = rim[tuple(coords.T.astype(int))].astype(np.uint8)
-        shares = [
-            np.mean(labels != np.array([rim[tuple(v)] for v in turned]))
-            for turned in (
-                np.where(np.eye(3)[k], coords, 63 - coords.astype(int)) for k in range(3)
-            )
-        ]
+        turned = (np.where(axis, coords, 63 - coords.astype(int)) for axis in np.eye(3))
+        shares = [np.mean(labels != rim[tuple(voxels.T)]) for voxels in turned]
         assert sum(share > HARMLESS for share in shares) == turns
         found = weigh(field, latents, aligned(), labels, a_model(), SampleParameters())
         assert len(found.against) == turns
@@ -282,9 +272,7 @@ HEARD = [
 
 
 @pytest.mark.parametrize(("evidence", "witnesses", "agreeing", "factor"), HEARD)
-def test_a_factor_makes_log_likelihoods_log_odds_where_witnesses_agree(
-    evidence, witnesses, agreeing, factor
-):
+def test_a_factor_makes_log_odds_where_witnesses_agree(evidence, witnesses, agreeing, factor):
     found = reliability_of(apart(evidence))
     assert (found.witnesses, found.agreeing) == (witnesses, agreeing)
     assert (
@@ -297,8 +285,7 @@ def test_assets_of_one_object_are_one_witness():
     """They share their latents or their labels, and agree or differ together."""
     same = [(f"{k % 3}", compared([1.0])) for k in range(36)]
     assert (found := reliability_of(same)).factor == 0.0 and found.witnesses == 3
-    rows = [(str(k), compared([0.25])) for k in range(20) for _ in range(k + 1)]
-    found = reliability_of(rows)
+    found = reliability_of([(str(k), compared([0.25])) for k in range(20) for _ in range(k + 1)])
     assert (found.witnesses, found.agreeing) == (20, 20)
     assert found.factor == pytest.approx(np.log(21.0) / 0.25)
     # An object agrees if most of its assets do.
@@ -370,9 +357,7 @@ is chosen: which, with what probability, what in log likelihood and voxels decid
 
 
 @pytest.mark.parametrize(("support", "differing", "reliability", "expected"), CHOICES)
-def test_the_likeliest_placement_is_taken_if_that_is_decisive(
-    support, differing, reliability, expected
-):
+def test_the_likeliest_placement_is_taken_if_decisive(support, differing, reliability, expected):
     tied = LatentEvidence(np.array(support), np.array(differing), 1000, 1.0, ())
     chosen = choice_of(tied, reliability)
     assert (chosen is None) == (expected is None)
@@ -432,10 +417,8 @@ class Asset:
         self.latents = StructuredLatents(latents_of(coords).coords, feats)
 
     def evidence(self, models: list[LatentModel], *tied: np.ndarray) -> LatentEvidence:
-        model = models[fold_of(self.object_id)]
-        return weigh(
-            self.field, self.latents, aligned(*tied), self.material, model, SampleParameters()
-        )
+        given = self.field, self.latents, aligned(*tied), self.material
+        return weigh(*given, models[fold_of(self.object_id)], SampleParameters())
 
 
 @cache

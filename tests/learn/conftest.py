@@ -1,5 +1,6 @@
 """A small store for everything that learns."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -35,3 +36,9 @@ def learn_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     build_store(dataset.parameters(), out)
     assert [int(np.sum(~one.valid)) for one in open_store(out)] == [0, 12, *[0] * 7]
     return out
+
+
+@pytest.fixture
+def learn_copy(learn_store: Path, tmp_path: Path) -> Path:
+    """Return a copy of the store that may be changed."""
+    return Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))

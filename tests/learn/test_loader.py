@@ -3,10 +3,8 @@
 import hashlib
 import itertools
 import re
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,25 +69,22 @@ def test_filters(learn_store):
         learn.SlatDataset(store, "train", shares=learn.Shares(0.0, 0.0, 1.0))
 
 
-def test_failed_assets_are_left_out_unless_all_are_asked_for(learn_store, tmp_path):
-    copy = Path(shutil.copytree(learn_store, tmp_path / "copy.zarr"))
-    verdicts = zarr.open_group(copy, mode="r+", use_consolidated=False)["asset/verdict"]
-    words = np.asarray(verdicts[:]).astype(object)
-    words[[1, 4, 7]] = "failed", "doubtful", "failed"
-    verdicts[:] = words
-    dataset = learn.SlatDataset(copy)
+def test_failed_assets_are_left_out_unless_all_are_asked_for(learn_copy):
+    for row, verdict in ((1, "failed"), (4, "doubtful"), (7, "failed")):
+        rewrite(learn_copy, "asset/verdict", row, verdict)
+    dataset = learn.SlatDataset(learn_copy)
     assert dataset.indices.tolist() == [0, 2, 3, 4, 5, 6, 8]
-    assert f"{copy}, split all: 7 assets, 2 left out by verdict" in repr(dataset)
+    assert f"{learn_copy}, split all: 7 assets, 2 left out by verdict" in repr(dataset)
     assert dataset[-1].asset_id == dataset[6].asset_id == dataset.asset_ids[-1]
     for number in (7, -8):
         with pytest.raises(IndexError):
             dataset[number]
     for everything in ("all", (), ("all", "good")):
-        assert len(learn.SlatDataset(copy, verdicts=everything)) == 9
-    parts = [learn.SlatDataset(copy, split, shares=THIRDS) for split in SPLITS]
+        assert len(learn.SlatDataset(learn_copy, verdicts=everything)) == 9
+    parts = [learn.SlatDataset(learn_copy, split, shares=THIRDS) for split in SPLITS]
     left = [int(re.search(r"(\d+) left out", repr(part))[1]) for part in parts]
     assert sum(map(len, parts)) == 7 and sum(left) == 2
-    assert next(iter(learn.SlatLoader(copy, 9))).asset_ids == dataset.asset_ids
+    assert next(iter(learn.SlatLoader(learn_copy, 9))).asset_ids == dataset.asset_ids
 
 
 def test_batch_is_what_zarr_reads(learn_store):
@@ -107,8 +102,7 @@ def test_batch_is_what_zarr_reads(learn_store):
     np.testing.assert_allclose(batch.feats, feats, rtol=1e-5, atol=1e-6)
     valid = root["voxel/valid"][rows]
     np.testing.assert_array_equal(batch.valid, valid)
-    properties = np.nan_to_num(root["voxel/properties"][rows])
-    np.testing.assert_array_equal(batch.properties, properties)
+    np.testing.assert_array_equal(batch.properties, np.nan_to_num(root["voxel/properties"][rows]))
     material = np.where(valid, root["voxel/material"][rows].astype(int), learn.IGNORED)
     np.testing.assert_array_equal(batch.material, material)
     spans = list(itertools.pairwise(offset[:4].tolist()))
@@ -139,12 +133,10 @@ def test_workers_change_nothing(learn_store, workers, method, first):
     assert one != other
 
 
-def test_no_worker_reads_another_store_at_the_same_path(learn_store, tmp_path):
+def test_no_worker_reads_another_store_at_the_same_path(learn_copy):
     """The same assets, whose rows an update has in another order."""
-    path = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
-    loader = learn.SlatLoader(learn.SlatDataset(path), 2, workers=1, start_method="spawn")
-    ids = loader.dataset.asset_ids
-    rewrite(path, "asset/id", slice(2), ids[1::-1])
+    loader = learn.SlatLoader(learn.SlatDataset(learn_copy), 2, workers=1, start_method="spawn")
+    rewrite(learn_copy, "asset/id", slice(2), loader.dataset.asset_ids[1::-1])
     with pytest.raises(StoreError, match="was the store replaced"):
         list(loader)
 
@@ -159,8 +151,7 @@ def test_a_damaged_file_is_the_same_error_in_a_worker(learn_store, tmp_path, wor
 
 
 def test_a_plain_loader_augments_each_epoch_anew(learn_store):
-    ours = learn.SlatDataset(learn_store, augmentation="all", seed=3)
-    loader = learn.SlatLoader(ours, 3)
+    loader = learn.SlatLoader(learn.SlatDataset(learn_store, augmentation="all", seed=3), 3)
     dataset = learn.SlatDataset(learn_store, augmentation="all", seed=3)
     plain = DataLoader(dataset, 3, collate_fn=learn.collate, num_workers=2)
     found = []
@@ -184,13 +175,15 @@ def test_each_pass_of_a_loader_is_the_next_epoch(learn_store):
         assert all(map(torch.equal, own, expected)) and len(own) == len(loader)
 
 
-@pytest.mark.parametrize(
-    "given", [{"min_confidence": 90}, {"min_confidence": np.nan}, {"seed": -1}]
-)
-def test_numbers_out_of_range_are_refused(learn_store, given):
-    (name,) = given
-    with pytest.raises(ConfigError, match=f"{name} is .*; expected 0"):
-        learn.SlatDataset(learn_store, **given)
+@pytest.mark.parametrize(("name", "value", "expected"), [
+    ("min_confidence", 90, "0"),
+    ("min_confidence", np.nan, "0"),
+    ("seed", -1, "0"),
+    *(("augmentation", kind, "one of none, upright, all") for kind in (None, "Upright", "al")),
+])  # fmt: skip
+def test_what_no_dataset_can_be_given_is_refused(learn_store, name, value, expected):
+    with pytest.raises(ConfigError, match=f"{name} is .*; expected {expected}"):
+        learn.SlatDataset(learn_store, **{name: value})
 
 
 def test_symmetries_are_the_groups_they_should_be():
@@ -203,18 +196,9 @@ def test_symmetries_are_the_groups_they_should_be():
         assert all(np.array_equal(m @ m.T, np.eye(3)) for m in matrices)
 
 
-@pytest.mark.parametrize("kind", [None, "Upright", "al"])
-def test_an_unknown_augmentation_is_refused(learn_store, kind):
-    with pytest.raises(ConfigError, match="expected one of none, upright, all"):
-        learn.SlatDataset(learn_store, augmentation=kind)
-
-
 def test_augmentation_moves_coordinates_and_nothing_else(learn_store):
-    plain, turned = (
-        learn.SlatDataset(learn_store),
-        learn.SlatDataset(learn_store, augmentation="all", seed=1),
-    )
-    moved = 0
+    plain, moved = learn.SlatDataset(learn_store), 0
+    turned = learn.SlatDataset(learn_store, augmentation="all", seed=1)
     for k in range(len(plain)):
         for name in ("feats", "properties", "material", "valid"):
             assert torch.equal(getattr(plain[k], name), getattr(turned[k], name))
@@ -250,11 +234,11 @@ def test_splits_part_the_store_keep_views_together_and_do_not_depend_on_filters(
             assert set(some) <= set(whole[split])
 
 
-def test_voxels_that_are_not_sure_enough_are_left_out(learn_store, tmp_path):
-    doubtful = Path(shutil.copytree(learn_store, tmp_path / "doubtful.zarr"))
-    array = zarr.open_group(doubtful, mode="r+", use_consolidated=False)["voxel/confidence"]
-    array[:] = array[:] * np.random.default_rng(0).uniform(size=array.shape)
-    store = open_store(doubtful)
+def test_voxels_that_are_not_sure_enough_are_left_out(learn_copy):
+    sure = zarr.open_group(learn_copy, mode="r")["voxel/confidence"][:]
+    spread = sure * np.random.default_rng(0).uniform(size=len(sure))
+    rewrite(learn_copy, "voxel/confidence", slice(None), spread)
+    store = open_store(learn_copy)
     spread = np.concatenate([asset.confidence[asset.valid] for asset in store])
     least = float(np.median(spread))
     assert (spread >= least).any() and (spread < least).any()
@@ -269,21 +253,18 @@ def test_voxels_that_are_not_sure_enough_are_left_out(learn_store, tmp_path):
         assert not item.properties.numpy()[~kept].any()
 
 
-TINY = decoder.DecoderSize(24, 2, 2)
-
-
-def voxels(count: int, seed: int, batch: int = 0, extent: int = 64) -> tuple[Tensor, Tensor]:
+def voxels(count: int, seed: int, extent: int) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     flat = torch.randperm(extent**3, generator=generator)[:count]
     axes = (flat // extent**2, flat // extent % extent, flat % extent)
-    coords = torch.stack([torch.full((count,), batch), *axes], dim=1).int()
+    coords = torch.stack([torch.zeros_like(flat), *axes], dim=1).int()
     return coords, torch.randn(count, 8, generator=generator)
 
 
 @pytest.fixture
 def model() -> decoder.PhysicsDecoder:
     torch.manual_seed(0)
-    made = decoder.PhysicsDecoder(TINY)
+    made = decoder.PhysicsDecoder(decoder.SIZES["tiny"])
     # The heads begin at 0, which would hide everything before them.
     for head in (made.regression, made.classification):
         torch.nn.init.xavier_uniform_(head.weight)
@@ -326,9 +307,8 @@ def test_attention_equals_a_dense_reference(shift):
     place = [(int(b), *((int(i) + shift) // 8 for i in voxel)) for b, *voxel in coords]
     same = torch.tensor([[a == b for b in place] for a in place])
     heads = []
-    for q, k, v in zip(
-        *(part.split(12, dim=1) for part in attention.qkv(hidden).split(24, dim=1)), strict=True
-    ):
+    parts = (part.split(12, dim=1) for part in attention.qkv(hidden).split(24, dim=1))
+    for q, k, v in zip(*parts, strict=True):
         scores = (q @ k.T) / 12**0.5
         heads.append(scores.masked_fill(~same, -torch.inf).softmax(dim=1) @ v)
     torch.testing.assert_close(sparse, attention.out(torch.cat(heads, dim=1)), rtol=0, atol=1e-5)
@@ -339,8 +319,7 @@ def test_shifted_windows_carry_news_further(model):
     coords = torch.tensor([[0, 7, 0, 0], [0, 8, 0, 0], [0, 40, 40, 40]], dtype=torch.int32)
     feats = torch.zeros(3, 8, requires_grad=True)
     model(coords, feats).properties[0].sum().backward()
-    reached = feats.grad.abs().sum(dim=1) > 0
-    assert reached.tolist() == [True, True, False]
+    assert (feats.grad.abs().sum(dim=1) > 0).tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize("channels", [24, 64])

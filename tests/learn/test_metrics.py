@@ -1,11 +1,11 @@
 """Scores of predictions and of grids against cases by hand and a second computation."""
 
-import contextlib
 import json
 import math
 import os
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ import pytest
 import zarr
 from scipy.spatial import cKDTree
 from support.commands import document, refused, run
-from support.made_store import edit_attributes
+from support.made_store import edit_attributes, rewrite
 from support.predictions import right, write_one, write_predictions, zeros
 from support.synthetic import Dataset
 
@@ -116,35 +116,29 @@ def test_only_labelled_voxels_of_a_prediction_count(learn_store, tmp_path, form)
     assert list(means.values()) == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def test_without_classes_nothing_has_an_accuracy(learn_store, tmp_path):
-    store = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
-    edit_attributes(store, material_classes=[])
-    material = zarr.open_group(store, mode="r+", use_consolidated=False)["voxel/material"]
-    material[:] = np.where(material[:] == 255, 255, 0)
-    folder = write_changed(tmp_path / "p", store, lambda _, arrays, truth: arrays)
-    result = evaluate_store(folder, store, None)
+def test_without_classes_nothing_has_an_accuracy(learn_copy, tmp_path):
+    edit_attributes(learn_copy, material_classes=[])
+    material = zarr.open_group(learn_copy, mode="r")["voxel/material"][:]
+    rewrite(learn_copy, "voxel/material", slice(None), np.where(material == 255, 255, 0))
+    folder = write_changed(tmp_path / "p", learn_copy, lambda _, arrays, truth: arrays)
+    result = evaluate_store(folder, learn_copy, None)
     assert len(result.baselines) == 2
     for scores in (result.methods[OURS], *result.baselines.values()):
         assert math.isnan(scores.means["accuracy"]) and math.isfinite(scores.means["nu"])
 
 
-def test_columns_in_another_order_are_not_measured(learn_store, tmp_path):
-    def change(_: int, arrays: dict[str, Any], truth: object) -> dict[str, Any]:
-        return arrays | {"columns": np.array(["density", "youngs_modulus", "poissons_ratio"])}
-
-    folder = write_changed(tmp_path / "p", learn_store, change)
-    with pytest.raises(InputError, match="predicts density, youngs_modulus, poissons_ratio"):
+@pytest.mark.parametrize(("name", "words", "said"), [
+    ("columns", ["density", "youngs_modulus", "poissons_ratio"],
+     "predicts density, youngs_modulus, poissons_ratio"),
+    ("classes", MATERIAL_CLASSES[BACKGROUND - 1 :: -1],
+     "predicts stationary, snow, .*expected the classes jelly, "),
+])  # fmt: skip
+def test_columns_and_classes_in_another_order_are_refused(learn_store, tmp_path, name, words, said):
+    named = {name: np.array(words)}
+    folder = write_changed(tmp_path / "p", learn_store, lambda _, arrays, truth: arrays | named)
+    with pytest.raises(InputError, match=said):
         evaluate_store(folder, learn_store, None)
-
-
-def test_classes_in_another_order_are_not_measured(learn_store, tmp_path):
-    def change(_: int, arrays: dict[str, Any], truth: object) -> dict[str, Any]:
-        return arrays | {"classes": np.array(MATERIAL_CLASSES[BACKGROUND - 1 :: -1])}
-
-    folder = write_changed(tmp_path / "p", learn_store, change)
-    with pytest.raises(InputError, match=r"predicts stationary, .*expected the classes jelly, "):
-        evaluate_store(folder, learn_store, None)
-    with pytest.raises(InputError, match="predicts stationary, snow"):
+    with pytest.raises(InputError, match=said):
         predicted_field(next(folder.iterdir()), PIXIE_RANGES)
 
 
@@ -155,12 +149,8 @@ def test_columns_of_groups_are_an_attribute(form, learn_store, tmp_path):
         write_one(path, form, asset_id, zeros(store.read(row, ("coords",))))
 
     def name_columns(columns: list[str]) -> None:
-        with contextlib.ExitStack() as stack:
-            file: Any
-            if form == "hdf5":
-                file = stack.enter_context(h5py.File(path, "r+"))
-            else:
-                file = zarr.open_group(path, mode="r+")
+        opened = nullcontext(zarr.open_group(path)) if form == "zarr" else h5py.File(path, "r+")
+        with opened as file:
             for asset_id in store.ids:
                 file[asset_id]["properties"].attrs["columns"] = columns
 
@@ -183,8 +173,7 @@ def test_equal_scores_are_no_class(learn_store, tmp_path):
         return arrays | {"logits": scores}
 
     store = open_store(learn_store)
-    folder = write_changed(tmp_path / "p", learn_store, change)
-    result = evaluate_store(folder, learn_store, None)
+    result = evaluate_store(write_changed(tmp_path / "p", learn_store, change), learn_store, None)
     by_object: dict[str, list[float]] = {}
     for row, name in enumerate(store.column("object_id")):
         valid = store.read(row, ("valid",))["valid"]
@@ -194,17 +183,14 @@ def test_equal_scores_are_no_class(learn_store, tmp_path):
 
 
 def test_accuracy_is_of_the_predictions_with_classes(learn_store, tmp_path):
-    def change(row: int, arrays: dict[str, Any], truth: object) -> dict[str, Any]:
-        return arrays if row else {"properties": arrays["properties"]}
-
-    folder = write_changed(tmp_path / "p", learn_store, change)
+    folder = write_changed(
+        tmp_path / "p", learn_store,
+        lambda row, arrays, _: arrays if row else {"properties": arrays["properties"]},
+    )  # fmt: skip
     first = open_store(learn_store).ids[0]
     words = ("evaluate", folder, "--store", learn_store, "--split", "all")
-    shown = run(*words)
-    assert (
-        f"predictions without a class, not in the accuracy: {first} (1 in all; --json)"
-        in shown.stderr
-    )
+    said = f"predictions without a class, not in the accuracy: {first} (1 in all; --json)"
+    assert said in run(*words).stderr
     told = document(*words)
     assert told["classless"] == [first]
     assert told["methods"][OURS]["means"]["accuracy"] == 1.0
@@ -500,10 +486,8 @@ def test_with_grids_the_same_reference_models_stand_beside(case, tmp_path):
         arrays["ranges"] = open_store(case.store).normalization.spans
         np.savez(folder / f"{name}.npz", **arrays)
     splits = dict.fromkeys(NAMES, "train")
-    alone, beside = (
-        evaluate_store(folder, case.store, "train", grids=grids, splits=splits)
-        for grids in ({}, {"m": case.results})
-    )
+    alone = evaluate_store(folder, case.store, "train", splits=splits)
+    beside = evaluate_store(folder, case.store, "train", grids={"m": case.results}, splits=splits)
     assert alone.baselines == beside.baselines and len(alone.baselines) == 2
     assert alone.methods[OURS] == beside.methods[OURS]
     assert alone.partly_annotated == 0
@@ -535,6 +519,5 @@ def test_occupied_voxels_without_a_class_are_counted(make_dataset, tmp_path):
 def test_values_that_are_no_prediction_are_refused(case, tmp_path, change, words):
     for name in NAMES:
         written(tmp_path / f"{name}.npy", change(case.grids[name].astype(np.float64)))
-    refusal = pytest.raises(InputError, match=words) if words else contextlib.nullcontext()
-    with refusal:
+    with pytest.raises(InputError, match=words) if words else nullcontext():
         assert compared(case, tmp_path).problems == []

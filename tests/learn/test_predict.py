@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from support import commands
 from support.commands import document, refused
-from support.made_store import edit_attributes, make_store
+from support.made_store import edit_attributes, make_store, rewrite
 
 from slatprep import InputError, open_store
 from slatprep.extract import Session
@@ -127,13 +126,11 @@ def test_a_folder_of_slats_and_a_file_that_cannot_be_read(checkpoint, tmp_path):
     assert np.array_equal(np.load(out / "a.npz")["properties"], first)
     words = ("predict", slats, "--checkpoint", checkpoint, "--out", out, "--asset", "b.fron_t")
     assert f"{slats} has no asset 'b.fron_t'; did you mean b.front?" in refused(*words)
-    carried = predicted_field(out / "a.npz", None)
-    assert np.array_equal(carried.voxels, random_latents(1).coords)
+    assert np.array_equal(predicted_field(out / "a.npz", None).voxels, random_latents(1).coords)
 
 
 @pytest.mark.parametrize("command", ["predict", "train"])
-def test_a_device_that_is_not_there_is_named(checkpoint, tmp_path, monkeypatch, command):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+def test_a_device_that_is_not_there_is_named(checkpoint, tmp_path, command):
     weights = ["--checkpoint", checkpoint] if command == "predict" else []
     source = tmp_path / "data"
     source.mkdir()
@@ -340,18 +337,16 @@ def test_decoders_get_latents_as_trellis_draws_them(learn_store, tmp_path, trell
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply"]
 
 
-def test_standardised_latents_of_a_store_and_an_encoder_of_equal_moments_are_input(
-    checkpoint, learn_store, tmp_path, trellis
-):
-    store = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
+def test_standardised_latents_are_input_too(checkpoint, learn_store, learn_copy, tmp_path, trellis):
+    """Those of a store, and of an encoder of equal moments."""
     plain = open_store(learn_store).asset("a")
-    feats = zarr.open_group(store, mode="r+")["voxel/feats"]
+    feats = zarr.open_group(learn_copy, mode="r+")["voxel/feats"]
     feats[:] = (feats[:] - np.array(FEATS_MEAN)) / np.array(FEATS_STD)
-    latents = open_store(store).attributes["latents"]
-    edit_attributes(store, latents=latents | {"standardised": True, "encoder": "sam3d"})
-    step("decode-slat", store, "--asset", "a", "--out", tmp_path / "gaussians")
+    latents = open_store(learn_copy).attributes["latents"]
+    edit_attributes(learn_copy, latents=latents | {"standardised": True, "encoder": "sam3d"})
+    step("decode-slat", learn_copy, "--asset", "a", "--out", tmp_path / "gaussians")
     np.testing.assert_allclose(trellis.feats, plain.feats, atol=1e-5)
-    for path, out in ((learn_store, "plain"), (store, "standardised")):
+    for path, out in ((learn_store, "plain"), (learn_copy, "standardised")):
         run(path, "--checkpoint", checkpoint, "--asset", "a", "--out", tmp_path / out)
     said = (np.load(tmp_path / out / "a.npz")["properties"] for out in ("plain", "standardised"))
     np.testing.assert_allclose(*said, atol=1e-5)
@@ -362,15 +357,13 @@ def test_latents_of_an_encoder_without_moments_are_standardised_or_refused(check
     contents = replace(PIXIEVERSE, latents=LatentSpace("mine", 8, 64, standardised=True))
     model, ranges = make_decoder("small", contents), normalization_of(RANGES, "dataset")
     torch.save(checkpoint_state(model, "small", ranges, contents), checkpoint / "best.pt")
-    rng = np.random.default_rng(5)
-    feats = rng.normal(0.7, 0.9, (300, 8)).astype(np.float32)
+    feats = np.random.default_rng(5).normal(0.7, 0.9, (300, 8)).astype(np.float32)
     latents = replace(random_latents(5), feats=feats)
     save(tmp_path / "slats" / "a.npz", latents)
     words = (tmp_path / "slats", "--checkpoint", checkpoint, "--out", tmp_path / "p")
     told = run(*words)
     assert told["predicted"] == 1
-    said = replace(latents, standardised=True)
-    (field,) = predict(load_checkpoint(checkpoint), [said])
+    (field,) = predict(load_checkpoint(checkpoint), [replace(latents, standardised=True)])
     np.testing.assert_allclose(np.load(tmp_path / "p" / "a.npz")["properties"], field.properties)
     raw = tmp_path / "raw"
     save(raw / "a.npz", replace(latents, feats=3 * feats))
@@ -385,13 +378,11 @@ def test_latents_of_another_encoder_are_no_input(checkpoint, tmp_path):
     assert "latents of trellis2 (32 channels); expected those of trellis" in step(*words, code=2)
 
 
-def test_latents_of_a_store_are_held_to_what_a_file_s_are(checkpoint, learn_store, tmp_path):
-    store = Path(shutil.copytree(learn_store, tmp_path / "s.zarr"))
-    feats = zarr.open_group(store, mode="r+")["voxel/feats"]
-    feats[5] = np.nan
+def test_latents_of_a_store_are_held_to_what_a_file_s_are(checkpoint, learn_copy, tmp_path):
+    rewrite(learn_copy, "voxel/feats", 5, np.nan)
     for fault in ("finite", "has no sound index"):
-        told = run(store, "--checkpoint", checkpoint, "--out", tmp_path / "p", code=1)
+        told = run(learn_copy, "--checkpoint", checkpoint, "--out", tmp_path / "p", code=1)
         assert told["predicted"] == 8  # the other assets' rows are in other shards
         (problem,) = told["problems"]
         assert fault in problem and (fault != "finite" or "[a]" in problem)
-        (store / "voxel/feats/c/0/0").write_bytes(b"")
+        (learn_copy / "voxel/feats/c/0/0").write_bytes(b"")

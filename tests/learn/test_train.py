@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -75,9 +76,7 @@ def test_loss_by_hand():
 
 
 def weights_of(path: Path) -> dict[str, torch.Tensor]:
-    state = torch.load(path, weights_only=True)
-    model: dict[str, torch.Tensor] = state["model"]
-    return model
+    return torch.load(path, weights_only=True)["model"]
 
 
 def shown(run: Path, name: str) -> list[tuple[int, float]]:
@@ -317,11 +316,9 @@ def test_a_run_is_trained_by_one_process_at_a_time(tmp_path, monkeypatch):
 
 
 def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(tmp_path, monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     with monkeypatch.context() as patched, open_run(tmp_path / "run") as run:
-        patched.setattr("slatprep.storage.atomic.flush", full)
+        patched.setattr("slatprep.storage.atomic.flush", Mock(side_effect=full))
         with pytest.raises(OSError, match="No space left"):
             run.begin({"seed": 7}, Assignment({}))
         assert not (tmp_path / "run/run.json").exists()
@@ -332,10 +329,9 @@ def test_a_run_on_a_full_disk_leaves_no_half_of_its_parameters(tmp_path, monkeyp
         assert run.parameters.keys() == {"seed", "splits"}
 
 
-@pytest.mark.parametrize(
-    ("flags", "precision"),
-    [("avx2 avx512f", "fp32"), ("avx512f avx512_bf16", "bf16"), ("amx_bf16", "bf16")],
-)
+@pytest.mark.parametrize(("flags", "precision"), [
+    ("avx2 avx512f", "fp32"), ("avx512f avx512_bf16", "bf16"), ("amx_bf16", "bf16"),
+])  # fmt: skip
 def test_precision_is_that_of_the_processor(flags, precision, monkeypatch):
     text = f"processor : 0\nmodel name : any\nflags : fpu {flags}\n"
     monkeypatch.setattr(Path, "read_text", lambda path, **_: text)
@@ -463,8 +459,7 @@ def test_steps_end_where_they_are_told_to(learn_store, tmp_path, steps):
 
 def test_without_classes_no_accuracy_is_told(learn_store, tmp_path, monkeypatch):
     monkeypatch.setattr("slatprep.learn.train._Session.validate", lambda _: (0.5, 0.25, math.nan))
-    words = ("train", learn_store, "--out", tmp_path / "run", "--epochs", "1", *FAST)
-    said = run(*words).output
+    said = run("train", learn_store, "--out", tmp_path / "run", "--epochs", "1", *FAST).output
     assert "MSE 0.2500" in said and "0.25" in said.split("Validation")[1]
     assert "accuracy" not in said and "nan" not in said
 
@@ -494,16 +489,11 @@ def test_the_last_weights_need_no_validation(learn_store, tmp_path):
 def test_the_paper_s_preset_is_what_is_not_given(
     words, steps, accumulate, learn_store, tmp_path, monkeypatch
 ):
-    asked: list[TrainParameters] = []
-
-    def stop(store: Path, out: Path, parameters: TrainParameters, **_: object) -> None:
-        asked.append(parameters)
-        raise ConfigError("far enough")
-
+    stop = Mock(side_effect=ConfigError("far enough"))
     monkeypatch.setattr("slatprep.learn.train.train", stop)
     told = refused("train", learn_store, "--out", tmp_path / "run", "--preset", "paper", *words)
     assert "far enough" in told
-    (chosen,) = asked
+    _, _, chosen = stop.call_args.args
     assert (chosen.steps, chosen.accumulate) == (steps, accumulate)
     assert chosen.weigh_by_confidence is ("--weigh-by-confidence" in words)
     # As the paper prints them.

@@ -266,8 +266,7 @@ def test_a_rigid_motion_moves_and_turns_each_gaussian_exactly(axes, seed):
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_an_affine_motion_deforms_covariances_where_asked(seed):
-    rng = np.random.default_rng(seed)
-    affine = np.eye(3) + rng.uniform(-0.25, 0.25, (3, 3))
+    affine = np.eye(3) + np.random.default_rng(seed).uniform(-0.25, 0.25, (3, 3))
     saved = random_gaussians(40, seed)
     motion = np.tile(affine, (len(REST), 1, 1))
     carrier = gaussians.bind(columns(saved), REST, H)
@@ -285,8 +284,7 @@ def test_an_affine_motion_deforms_covariances_where_asked(seed):
 def test_files_of_gaussians_keep_every_field(tmp_path):
     saved = random_gaussians(30)
     gaussians.write_gaussians(tmp_path / "g.ply", saved, "frame SLAT, unit cube -0.5..0.5, z up")
-    vertex = plyfile.PlyData.read(tmp_path / "g.ply")["vertex"].data
-    np.testing.assert_array_equal(vertex, saved)
+    np.testing.assert_array_equal(plyfile.PlyData.read(tmp_path / "g.ply")["vertex"].data, saved)
 
 
 def test_the_nearest_gaussian_is_drawn_in_its_colour(tmp_path):
@@ -494,14 +492,10 @@ def test_gaussians_of_trellis_fall_as_the_object_does(tmp_path):
         assert animation.n_frames >= 6
 
 
-# -- the examples ---------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[np.ndarray, ...]]:
     folder = tmp_path_factory.mktemp("drop")
-    store = open_store(drop.make_store(folder))
-    return folder, drop.particles(store, "drop", 32, folder)
+    return folder, drop.particles(open_store(drop.make_store(folder)), "drop", 32, folder)
 
 
 def test_particles_have_the_materials_that_were_made(made):
@@ -584,8 +578,7 @@ def test_objects_have_the_materials_of_their_source(store, prediction):
     found = scenes.objects(argparse.Namespace(**named, ranges=None))
     assert list(found) == ["cup", "water"]
     for name, (coords, field) in found.items():
-        positions = scenes.fill(coords, 32)
-        given = scenes.transfer(positions, field, far="nearest")
+        given = scenes.transfer(scenes.fill(coords, 32), field, far="nearest")
         expected = {4} if name == "water" else {JELLY[0], METAL[0]}
         assert set(given.material.tolist()) == expected
 

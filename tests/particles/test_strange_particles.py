@@ -31,8 +31,7 @@ def refused(file: Path, said: str, most: float = 100e6) -> None:
 def test_lists_are_no_fault_beside_the_coordinates_alone(tmp_path):
     body = struct.pack("<3fB2f", 0.1, 0.2, 0.3, 2, 1, 1)
     elements = f"element vertex 1\n{XYZ}property list uchar float w\n"
-    read = read_particles(_ply(tmp_path / "p.ply", elements, body))
-    assert read.positions.shape == (1, 3)
+    assert read_particles(_ply(tmp_path / "p.ply", elements, body)).positions.shape == (1, 3)
     lists = elements.replace("float x", "list uchar float x")
     refused(_ply(tmp_path / "p.ply", lists, body), "list")
 

@@ -17,6 +17,7 @@ from slatprep.export import ExportOptions, export_store
 from slatprep.particles.fields import VoxelField, predicted_field
 from slatprep.particles.read import read_particles
 from slatprep.particles.transfer import transfer
+from slatprep.records import Normalization
 from slatprep.store import open_store
 
 # As TRELLIS names and orders the fields of a Gaussian (`construct_list_of_attributes`).
@@ -104,12 +105,8 @@ def test_wrong_axes_are_an_error_that_names_the_right_ones(axes, turn, store, tr
     assert run(*words, "--axes", axes)["far"] == 0
     (tmp_path / "m.ply").unlink()
     for other in {"trellis", "glb", "slat"} - {axes}:
-        said = run_wrong(*words, "--axes", other)
-        assert f"with --axes {axes} 0% would be far" in said
+        assert f"with --axes {axes} 0% would be far" in run_wrong(*words, "--axes", other)
         assert not (tmp_path / "m.ply").exists()
-
-
-# -- axes of TRELLIS and of SAM 3D Objects -----------------------------
 
 
 def write_prediction(path: Path, coords: np.ndarray, material: np.ndarray) -> None:
@@ -145,8 +142,7 @@ def test_axes_that_fit_alike_are_asked_for(shape, tmp_path):
         axes = "trellis" if write is write_gaussians else "slat"
         words = ("--prediction", tmp_path / "two.npz", "--out", out, "--axes", axes)
         run(tmp_path / "g.ply", *words)
-        given = columns(out, ["material_id"])[:, 0]
-        np.testing.assert_array_equal(given, positions[:, 2] > 0)
+        np.testing.assert_array_equal(columns(out, ["material_id"])[:, 0], positions[:, 2] > 0)
         out.unlink()
 
 
@@ -168,9 +164,7 @@ def test_particles_that_are_far_are_told_or_an_error(store, true_parts, tmp_path
     ([name for name in GAUSSIAN if name[0] != "n"], 0.4, "it has no normals"),
     (GAUSSIAN, 3.0, "it reaches 3 from the centre, out of the unit cube"),
 ])  # fmt: skip
-def test_gaussians_of_another_tool_are_not_taken_for_trellis(
-    names, reach, sign, store, true_parts, tmp_path
-):
+def test_gaussians_of_another_tool_are_told_apart(names, reach, sign, store, true_parts, tmp_path):
     positions = particles_near(true_parts[0], 400, 0.45)
     write_points(tmp_path / "g.ply", positions * reach / abs(positions).max(), names)
     read = read_particles(tmp_path / "g.ply")
@@ -191,8 +185,7 @@ def test_what_slatprep_wrote_says_its_frame(store, true_parts, tmp_path):
     write_gaussians(tmp_path / "g.ply", particles_near(true_parts[0], 200, 0.4))
     words = ("--store", store, "--asset", "cup", "--out")
     run(tmp_path / "g.ply", *words, tmp_path / "once.ply")
-    again = run(tmp_path / "once.ply", *words, tmp_path / "twice.ply")
-    assert again["axes"] == "trellis"
+    assert run(tmp_path / "once.ply", *words, tmp_path / "twice.ply")["axes"] == "trellis"
     assert (tmp_path / "once.ply").read_bytes() == (tmp_path / "twice.ply").read_bytes()
 
     for points, frame in (("slat", "slat"), ("grid", "slat"), ("grid", "pixieverse")):
@@ -267,14 +260,21 @@ def test_prediction_is_transferred_as_the_store_is(store, tmp_path):
     assert (tmp_path / "stored.ply").read_bytes() == (tmp_path / "predicted.ply").read_bytes()
 
 
+def predicted(
+    folder: Path, normalization: Normalization | None = None, **arrays: Any
+) -> VoxelField:
+    """Write a prediction and read it."""
+    np.savez(folder / "p.npz", **arrays)
+    return predicted_field(folder / "p.npz", normalization)
+
+
 @pytest.mark.parametrize("side", [32, 64, 128])
 def test_a_particle_at_a_voxel_s_centre_gets_its_material(tmp_path, side):
     block = np.argwhere(np.ones((6, 6, 6))) + side // 3
     kinds = block.sum(axis=1) % 2
     stuff = np.array([[1e5, 1e3, 0.3], [1e9, 2e3, 0.4]], np.float32)[kinds]
-    arrays = {"coords": block, "material": kinds, "properties_si": stuff}
-    np.savez(tmp_path / "p.npz", resolution=side, **arrays)
-    found = transfer((block + 0.5) / side - 0.5, predicted_field(tmp_path / "p.npz", None))
+    arrays = {"coords": block, "material": kinds, "properties_si": stuff, "resolution": side}
+    found = transfer((block + 0.5) / side - 0.5, predicted(tmp_path, **arrays))
     np.testing.assert_array_equal(found.material, kinds)
     np.testing.assert_array_equal(found.properties, stuff)
     assert found.far == 0 and (found.distance.max() < 1e-9 or side < 64)
@@ -283,18 +283,14 @@ def test_a_particle_at_a_voxel_s_centre_gets_its_material(tmp_path, side):
 def test_prediction_in_si_needs_no_ranges(tmp_path):
     coords = np.array([[0, 1, 2, 3], [0, 4, 5, 6]], np.int32)
     values = np.array([[1e5, 1e3, 0.3], [np.nan] * 3], np.float32)
-
-    def predicted(**arrays: object) -> VoxelField:
-        np.savez(tmp_path / "p.npz", coords=coords, material=np.array([2, 255]), **arrays)
-        return predicted_field(tmp_path / "p.npz", None)
-
-    field = predicted(properties_si=values, valid=np.array([True, False]))
+    arrays, valid = {"coords": coords, "material": np.array([2, 255])}, np.array([True, False])
+    field = predicted(tmp_path, **arrays, properties_si=values, valid=valid)
     np.testing.assert_array_equal(field.voxels, [[1, 2, 3]])
     np.testing.assert_array_equal(field.properties, values[:1])
     with pytest.raises(ConfigError, match="--ranges"):
-        predicted(properties=values, valid=np.array([True, False]))
+        predicted(tmp_path, **arrays, properties=values, valid=valid)
     with pytest.raises(InputError, match="has class 255"):
-        predicted(properties_si=values)
+        predicted(tmp_path, **arrays, properties_si=values)
 
 
 def test_prediction_by_its_own_ranges(store, tmp_path):
@@ -304,30 +300,25 @@ def test_prediction_by_its_own_ranges(store, tmp_path):
     mapped[:, :2] = np.log10(mapped[:, :2])
     values = 2 * (mapped - spans[:, 0]) / (spans[:, 1] - spans[:, 0]) - 1
     scores = np.eye(8)[asset.material[asset.valid]]
-    arrays = {"coords": asset.coords[asset.valid], "properties": values, "logits": scores}
-    np.savez(tmp_path / "p.npz", **arrays, ranges=spans)
+    arrays = {"coords": asset.coords[asset.valid], "properties": values, "ranges": spans}
     for normalization in (open_store(store).normalization, None):
-        field = predicted_field(tmp_path / "p.npz", normalization)
+        field = predicted(tmp_path, normalization, **arrays, logits=scores)
         np.testing.assert_allclose(field.properties, asset.properties_si[asset.valid], rtol=1e-5)
         np.testing.assert_array_equal(field.material, asset.material[asset.valid])
     scores[0], scores[1, :2] = 1.0, 2.0
-    np.savez(tmp_path / "p.npz", **arrays, ranges=spans)
-    field = predicted_field(tmp_path / "p.npz", None)
+    field = predicted(tmp_path, **arrays, logits=scores)
     assert len(field.material) == len(scores) - 1
     np.testing.assert_array_equal(field.material[0], 0)
-    arrays["logits"] = np.zeros_like(scores)
-    np.savez(tmp_path / "p.npz", **arrays, ranges=spans)
     with pytest.raises(InputError, match="all classes have the same score"):
-        predicted_field(tmp_path / "p.npz", None)
+        predicted(tmp_path, **arrays, logits=np.zeros_like(scores))
 
 
 @pytest.mark.parametrize("wrong", [(-5.0, 1e3, 0.3), (1e5, 0.0, 0.3), (1e5, 1e3, 0.9)])
 def test_prediction_of_values_that_no_material_has(tmp_path, wrong):
     values = np.array([(1e5, 1e3, 0.3), wrong])
     coords = np.array([[1, 2, 3], [4, 5, 6]])
-    np.savez(tmp_path / "p.npz", coords=coords, material=np.zeros(2, int), properties_si=values)
     with pytest.raises(InputError, match="row 1 has class 0 and properties"):
-        predicted_field(tmp_path / "p.npz", None)
+        predicted(tmp_path, coords=coords, material=np.zeros(2, int), properties_si=values)
 
 
 def test_a_file_that_transfer_did_not_write_is_not_replaced(store, tmp_path):

@@ -17,13 +17,7 @@ from slatprep.records import AssetPair, SourceRoots
 def make_pair(tmp_path: Path) -> Callable[..., AssetPair]:
     """Write the given arrays as sources and return the pair of them."""
 
-    def make(
-        grid: np.ndarray | None = None,
-        mask: np.ndarray | None = None,
-        bounds: dict[str, object] | None = None,
-        coords: np.ndarray = COORDS,
-        feats: np.ndarray = FEATS,
-    ) -> AssetPair:
+    def make(grid=None, mask=None, bounds=None, coords=COORDS, feats=FEATS) -> AssetPair:
         folder = tmp_path / "pixieverse" / "a"
         folder.mkdir(parents=True, exist_ok=True)
         np.save(folder / "grid.npy", raw_grid() if grid is None else grid)
@@ -51,11 +45,10 @@ def find(tmp_path):
         for side, names in (("pixie", grids), ("slat", slats)):
             (tmp_path / side).mkdir(exist_ok=True)
             touch(tmp_path / side, *names)
-        parameters = BuildParameters(
-            pixieverse=PixieverseSource(**{"root": tmp_path / "pixie", **(pixieverse or {})}),
-            slat=SlatSource(**{"root": tmp_path / "slat", **(slat or {})}),
-            pairing=PairingParameters(**pairing),
+        sides = (
+            PixieverseSource(**{"root": tmp_path / "pixie", **(pixieverse or {})}),
+            SlatSource(**{"root": tmp_path / "slat", **(slat or {})}),
         )
-        return list(discover(parameters))
+        return list(discover(BuildParameters(*sides, pairing=PairingParameters(**pairing))))
 
     return run

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -106,9 +107,7 @@ def test_latents_that_are_none_are_refused(make_pair, case):
 
 @pytest.mark.parametrize("error", [KeyError("boom"), SystemExit(3), GeneratorExit()])
 def test_whatever_is_raised_is_theirs(make_pair, error):
-    def call(*_: object) -> Any:
-        raise error
-
+    call = Mock(side_effect=error)
     adapter = source(describe=call, read=call, find=call)
     for ask in (
         lambda: adapter.describe(None),

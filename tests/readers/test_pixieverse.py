@@ -86,18 +86,15 @@ def test_prediction_beyond_its_range_is_clipped_and_counted(make_pair):
     assert "youngs_modulus" in clipped[0]
 
 
-def _noisy_scores() -> np.ndarray:
-    noise = np.random.default_rng(0).random((8, 64, 64, 64), dtype=np.float32)
-    return changed(SCORES, (np.s_[3:], 4 * SCORES[3:] - noise))
-
-
+NOISE = np.random.default_rng(0).random((8, 64, 64, 64), dtype=np.float32)
+NOISY = changed(SCORES, (np.s_[3:], 4 * SCORES[3:] - NOISE))
 # No class at all is not jelly.
 TIED = changed(SCORES, (np.s_[3:, 1, 2, 3], 0), (np.s_[3:10, 1, 2, 3], 1))
 ISLAND = changed(RAW, (np.s_[10, 10, 10:12], (0, 0, 0, -1)))
 OTHER_MASK = changed(MASK, ((1, 2, 3), 0), (np.s_[20, 20, 20:24], 1))
 SOFT_MASK = changed(MASK, ((1, 2, 3), 0.5), ((1, 2, 4), 0.75))
 ODD = {
-    "scores not one-hot": (_noisy_scores(), None, 3, []),
+    "scores not one-hot": (NOISY, None, 3, []),
     "tied scores": (TIED, MASK, 3, ["1 voxels have no single highest class score; not annotated",
                                     "1 occupied voxels have no class (-1); not annotated"]),
     "an island": (ISLAND, None, 5, ["2 occupied voxels have no class (-1); not annotated"]),
@@ -141,18 +138,16 @@ def test_a_mask_that_contradicts_its_grid_is_told_or_refused(make_pair):
     few = np.roll(same, 1, axis=0)
     assert "leaves out 10% of" in read_field(make_pair(grid=grid, mask=few)).warnings[-1]
     unlabelled = changed(grid, (np.s_[20:24, 20:30, 20:30, 3], -1))
-    assert not any(
-        "unusual" in w for w in read_field(make_pair(grid=unlabelled, mask=same)).warnings
-    )
     channels = np.moveaxis(changed(grid, (np.s_[..., :3], 0.5)), -1, 0).astype(np.float32)
-    predicted = read_field(make_pair(grid=channels, mask=np.roll(same, 7, axis=0)))
-    assert not any("unusual" in text for text in predicted.warnings)  # Any class may lie outside.
+    # Of a prediction any class may lie outside.
+    for one, mask in ((unlabelled, same), (channels, np.roll(same, 7, axis=0))):
+        told = read_field(make_pair(grid=one, mask=mask)).warnings
+        assert not any("unusual" in text for text in told)
     part = same & np.roll(same, 7, axis=0)
     *_, told = read_field(make_pair(grid=grid, mask=part)).warnings
     assert "leaves out 70% of the voxels with a class, and 0% of it is" in told
     for plausibility, tells in (("warn", True), ("off", False)):
-        roots = replace(other.roots, plausibility=plausibility)
-        field = read_field(replace(other, roots=roots))
+        field = read_field(replace(other, roots=replace(other.roots, plausibility=plausibility)))
         assert len(field.voxels) == 300
         assert any("unusual masks" in text for text in field.warnings) == tells
 
@@ -177,16 +172,13 @@ def test_unreadable_bounds_are_a_warning(make_pair):
     (warning,) = field.warnings
     assert "pickle" in warning
     assert warning.startswith("bounds: a/bounds.npz")
+    (warning,) = read_field(make_pair(bounds={"min_bounds": np.nan})).warnings
+    assert warning == "bounds: a/bounds.npz [min_bounds] is not finite; left out"
     for content in (b"not a zip", b""):
         pair.bounds.write_bytes(content)
         field = read_field(pair)
         assert field.bounds is None
         assert field.warnings[0].startswith("bounds not read: a/bounds.npz: ")
-
-
-def test_bounds_that_are_no_numbers_are_named_below_the_root(make_pair):
-    (warning,) = read_field(make_pair(bounds={"min_bounds": np.nan})).warnings
-    assert warning == "bounds: a/bounds.npz [min_bounds] is not finite; left out"
 
 
 CLASS = (9, 8, 7, 3)
@@ -255,8 +247,7 @@ def test_an_asset_fails_by_the_share_of_its_unphysical_voxels(make_pair):
 
 @pytest.mark.parametrize("material", [-1, 7], ids=["without class", "outside the object"])
 def test_values_of_a_voxel_that_is_not_annotated_do_not_matter(make_pair, material):
-    grid = changed(RAW, ((30, 30, 30), (np.nan, -1, 9, material)))
-    read = read_field(make_pair(grid=grid))
+    read = read_field(make_pair(grid=changed(RAW, ((30, 30, 30), (np.nan, -1, 9, material)))))
     assert read.voxels.tolist() == VOXELS
     assert read.unphysical == 0
 

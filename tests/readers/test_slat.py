@@ -70,16 +70,12 @@ def test_every_form_is_read_alike(make_pair, form):
         assert latents.sources == (source,)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": "gzip"},
-        {"fletcher32": True, "chunks": (2, 5)},
-        {"compression": "gzip", "shuffle": True, "fletcher32": True, "chunks": (2, 8)},
-        {"chunks": (1, 3)},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [
+    {"compression": "gzip"},
+    {"fletcher32": True, "chunks": (2, 5)},
+    {"compression": "gzip", "shuffle": True, "fletcher32": True, "chunks": (2, 8)},
+    {"chunks": (1, 3)},
+], ids=str)  # fmt: skip
 def test_hdf5_chunks_and_filters(make_pair, options):
     feats = {"data": FEATS, **options}
     check(read_latents(hdf5_pair(make_pair(), "a", coords=COORDS, feats=feats)))
@@ -104,6 +100,7 @@ def test_shared_file_is_hashed_once_under_whatever_number_it_is_opened(make_pair
 
 
 OUT = "coordinate ({}) in row {} is out of range"
+LARGE = changed(FEATS.astype("f8"), ((2, 7), 1e300))
 BAD_ARRAYS = [
     ({"coords": COORDS[:, :2]}, "shape (3, 2)", "(N <= 262144, 3)"),
     ({"coords": COORDS.ravel()}, "shape (9,)", "(N <= 262144, 4)"),
@@ -119,11 +116,7 @@ BAD_ARRAYS = [
     ({"coords": changed(BATCHED, ((2, 1), 256))}, OUT.format("256, 63, 63", 2), "0..63"),
     ({"coords": changed(COORDS, (2, 0))}, "(0, 0, 0) occurs twice, in rows 0 and 2", "once"),
     ({"feats": changed(FEATS, ((0, 0), -np.inf))}, "feats is -inf in row 0", "finite"),
-    (
-        {"feats": changed(FEATS.astype("f8"), ((2, 7), 1e300))},
-        "1e+300 in row 2, channel 7",
-        "float32",
-    ),
+    ({"feats": LARGE}, "1e+300 in row 2, channel 7", "float32"),
     ({"coords": np.zeros((262145, 3), np.uint8)}, "shape (262145, 3)", "N <= 262144"),
 ]
 
@@ -235,18 +228,17 @@ def test_hdf5_whose_values_lie_elsewhere_or_nowhere_is_refused(make_pair, tmp_pa
     virtual = h5py.VirtualLayout((3, 8), np.float32)
     virtual[:] = h5py.VirtualSource(secret, "feats", (3, 8))
     empty = {"shape": (3, 8), "dtype": np.float32}
-    for number, (feats, fault) in enumerate(
-        [
-            (h5py.SoftLink("/0/coords"), "soft or external link"),
-            (h5py.ExternalLink(secret, "feats"), "soft or external link"),
-            (empty | {"external": [(str(raw), 0, 96)]}, "keeps its values in another file"),
-            (virtual, "virtual dataset"),
-            # HDF5 would read zeros, which are latents as good as any.
-            (empty, "holds 0 of 96 bytes"),
-            (empty | {"chunks": (2, 8)}, "its 0 chunks are not the 2"),
-            ({"data": FEATS, "compression": "lzf"}, r"uses HDF5 filters \[32000\].*h5repack"),
-        ]
-    ):
+    cases = [
+        (h5py.SoftLink("/0/coords"), "soft or external link"),
+        (h5py.ExternalLink(secret, "feats"), "soft or external link"),
+        (empty | {"external": [(str(raw), 0, 96)]}, "keeps its values in another file"),
+        (virtual, "virtual dataset"),
+        # HDF5 would read zeros, which are latents as good as any.
+        (empty, "holds 0 of 96 bytes"),
+        (empty | {"chunks": (2, 8)}, "its 0 chunks are not the 2"),
+        ({"data": FEATS, "compression": "lzf"}, r"uses HDF5 filters \[32000\].*h5repack"),
+    ]
+    for number, (feats, fault) in enumerate(cases):
         pair = hdf5_pair(make_pair(), str(number), coords=COORDS, feats=feats)
         with pytest.raises(InputError, match=rf"\[{number}/feats\]: .*{fault}"):
             read_latents(pair)
@@ -262,10 +254,6 @@ def test_hdf5_chunk_that_fails_its_checksum_is_refused(make_pair):
         read_latents(pair)
 
 
-def moments_of(feats: np.ndarray) -> LatentMoments:
-    return LatentMoments(tuple(feats.mean(axis=0).tolist()), tuple(feats.std(axis=0).tolist()))
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_raw_and_standardised_latents_are_told_apart(seed):
     rng = np.random.default_rng(seed)
@@ -274,7 +262,7 @@ def test_raw_and_standardised_latents_are_told_apart(seed):
         z = rng.normal(size=(500, 8)) * spread + rng.normal(scale=off, size=8)
         raw = z * np.array(FEATS_STD) + np.array(FEATS_MEAN)
         for feats, right in ((z, True), (raw, False)):
-            moments = moments_of(feats)
+            moments = LatentMoments(tuple(feats.mean(axis=0)), tuple(feats.std(axis=0)))
             if off == 0.4 or tell_alone(moments, TRELLIS):
                 assert look_standardised(moments, TRELLIS) is right
 

@@ -27,8 +27,7 @@ def test_pixie_s_rule_is_torch_s_random_split(count):
     torch = pytest.importorskip("torch")
     ids = [f"{k:032x}" for k in range(count)]
     permutation = torch.randperm(count, generator=torch.Generator().manual_seed(42)).tolist()
-    expected = [ids[k] for k in permutation[int(0.9 * count) :]]
-    assert pixie_test_objects(reversed(ids)) == expected
+    assert pixie_test_objects(reversed(ids)) == [ids[k] for k in permutation[int(0.9 * count) :]]
 
 
 def test_pixie_s_rule_without_torch():
@@ -40,10 +39,8 @@ def test_pixie_s_rule_without_torch():
 
 @pytest.mark.parametrize("shares", [Shares(), Shares(0.5, 0.25, 0.25), Shares(1.0, 0.0, 0.0)])
 def test_what_no_rule_tests_on_is_parted_by_the_hash(shares):
-    for by, test in (
-        ("pixie", set(pixie_test_objects(OBJECTS))),
-        ("category:tree", {name for name, category in OBJECTS.items() if category == "tree"}),
-    ):
+    trees = {name for name, category in OBJECTS.items() if category == "tree"}
+    for by, test in (("pixie", set(pixie_test_objects(OBJECTS))), ("category:tree", trees)):
         splits = assign_splits(by, OBJECTS, shares).splits
         assert splits.keys() == OBJECTS.keys()
         assert {name for name, split in splits.items() if split == "test"} == test

@@ -42,10 +42,9 @@ COLUMNS = {
 """The properties that each adapter finds."""
 
 
-def rows_of(count: int, side: int = 64, seed: int = 0) -> dict[str, np.ndarray]:
+def rows_of(count: int, side: int = 64) -> dict[str, np.ndarray]:
     """Return voxels in no order, each once, and columns that tell them apart."""
-    rng = np.random.default_rng(seed)
-    cells = rng.choice(side**3, count, replace=False)
+    cells = np.random.default_rng(0).choice(side**3, count, replace=False)
     voxels = np.stack(np.unravel_index(cells, (side,) * 3), axis=1).astype(np.int32)
     return {
         "voxels": voxels,
@@ -56,12 +55,6 @@ def rows_of(count: int, side: int = 64, seed: int = 0) -> dict[str, np.ndarray]:
         "material": (cells % 3).astype(np.uint8),
         "segment": np.zeros(3, np.float32),  # not asked for
     }
-
-
-def in_order(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return rows in C order of the grid, as a field has them."""
-    order = np.lexsort(rows["voxels"].T[::-1])
-    return {name: column[order] for name, column in rows.items() if name != "segment"}
 
 
 def write_vomp(folder: Path, rows: dict[str, np.ndarray]) -> None:
@@ -90,6 +83,8 @@ def root(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("form", ["npz", "hdf5", "zarr", "ply", *sources.ONE_FRAME])
 def test_every_form_holds_the_same_72_000_voxels(root, form):
     rows = rows_of(72_000)
+    order = np.lexsort(rows["voxels"].T[::-1])  # of C, as a field has them
+    expected = {name: column[order] for name, column in rows.items() if name != "segment"}
     if form == "ply":
         del rows["segment"]  # Its vertices have no column of another length.
     if form == "vomp":
@@ -99,7 +94,7 @@ def test_every_form_holds_the_same_72_000_voxels(root, form):
     else:
         sources.write_voxels(root, "a", form, rows)
     adapter = form if form in sources.ONE_FRAME else "voxels"
-    field, expected = field_at(root, adapter), in_order(rows)
+    field = field_at(root, adapter)
     np.testing.assert_array_equal(field.voxels, expected["voxels"])
     assert [one.name for one in field.table] == COLUMNS[adapter]
     for one, values in zip(field.table, field.properties.T, strict=True):
@@ -123,7 +118,7 @@ def test_a_grid_of_128_may_be_fuller_than_all_of_64(root):
 
 
 def test_a_voxel_that_is_given_twice_is_refused_where_the_rows_differ(root):
-    rows = {name: column[:80] for name, column in rows_of(80).items()}
+    rows = rows_of(80)
     again = {name: np.concatenate([column, column[:1]]) for name, column in rows.items()}
     sources.write_voxels(root, "a", "npz", again)
     assert len(field_at(root).voxels) == 80
@@ -154,18 +149,16 @@ def test_a_resolution_that_is_not_the_voxels_own_is_told(root):
 
 
 def test_voxels_of_vomp_on_every_second_cell_or_not_finite_are_told(tmp_path):
-    rows = {name: column[:500] for name, column in rows_of(500, 32).items()}
-    coarse = rows | {"voxels": 2 * rows["voxels"]}
-    write_vomp(tmp_path / "coarse", coarse)
+    rows = rows_of(500, 32)
+    write_vomp(tmp_path / "coarse", rows | {"voxels": 2 * rows["voxels"]})
     (told,) = field_at(tmp_path / "coarse", "vomp").warnings
     assert "all coordinates are even, or all are odd, as on a grid of 32^3" in told
     # Its toolkit fills parts one by one, so that a cell where two touch occurs twice.
     twice = {name: np.concatenate([column, column[:1]]) for name, column in rows.items()}
     twice["density"][-1] = 9000.0
     write_vomp(tmp_path / "twice", twice)
-    assert (
-        "501 voxels were merged into 500 of 64^3" in field_at(tmp_path / "twice", "vomp").warnings
-    )
+    told = field_at(tmp_path / "twice", "vomp").warnings
+    assert "501 voxels were merged into 500 of 64^3" in told
     data = np.load(tmp_path / "coarse" / "a_with_materials.npz")["voxel_data"]
     data["y"][3] = np.nan
     np.savez(tmp_path / "coarse" / "a_with_materials.npz", voxel_data=data)
