@@ -40,6 +40,21 @@ KINDS = ("hdf5", "npz")
 """A format of one file, and one of a folder."""
 
 
+@pytest.mark.parametrize(("format", "points", "column"), [
+    ("ply", "slat", "clipped"), ("ply", "grid", "clipped_grid"), ("hdf5", None, "clipped"),
+])  # fmt: skip
+def test_values_that_the_build_clipped_are_told(format, points, column, copy, tmp_path):
+    for row, counts in enumerate([(4, 4, 4), (1000, 0, 2)]):
+        rewrite(copy, f"asset/{column}", row, counts)
+    ids, options = open_store(copy).ids, ExportOptions(points=points)
+    notes = [
+        export_store(copy, tmp_path / str(first), format, assets=ids[first:], options=options).notes
+        for first in (1, 2)
+    ]
+    beyond = "values beyond the store's ranges are taken as the end of the range"
+    assert notes == [(f"{beyond}: 1,000 of youngs_modulus, 2 of poissons_ratio",), ()]
+
+
 def test_hdf5_is_read_by_h5py(store, mixed, tmp_path):
     out, stored = tmp_path / "all.h5", open_store(store)
     export_store(store, out, "hdf5")

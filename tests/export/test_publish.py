@@ -91,11 +91,19 @@ def test_a_damaged_store_is_not_published(copy, tmp_path):
     assert "voxel/feats/c/0/0: is a link" in run(*words, code=1).stderr
 
 
-def test_only_assets_that_went_into_shards_are_counted(copy, tmp_path):
+def test_only_assets_that_went_into_shards_are_counted_and_drawn(copy, tmp_path, monkeypatch):
     rewrite(copy, "asset/verdict", 0, "failed")
-    words = (copy, "--data", "webdataset", "--pictures", 0, "--json")
+    drawn: list[list[str]] = []
+    monkeypatch.setattr(
+        "slatprep.inspect.pictures.write.sheet_of",
+        lambda store, ids: drawn.append(sorted(ids)) or b"",  # type: ignore[func-returns-value]
+    )
+    words = (copy, "--data", "webdataset", "--pictures", 9, "--json")
     left = json.loads(run(*words, "--out", tmp_path / "hub").stdout)["assets"]
-    assert left == len(open_store(copy)) - 1
+    first, *others = open_store(copy).ids
+    assert left == len(others) and drawn == [sorted(others)]
+    run(*words, "--out", tmp_path / "failed", "--verdict", "failed")
+    assert drawn[1:] == [[first]]
     card = (tmp_path / "hub" / "README.md").read_text()
     table = card.partition("## What is in it\n\n")[2].partition("\n\n")[0]
     rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]

@@ -143,6 +143,9 @@ def test_the_scene_has_every_asset_apart_from_the_others(exported):
         for other in boxes[:number]:
             gaps = (np.subtract(a.GetMin(), b.GetMax()) for a, b in ((box, other), (other, box)))
             assert np.max(list(gaps)) > 0
+    side = np.ceil(np.sqrt(len(found))) * 1.25 * SIZE
+    ends = [end for box in boxes for end in (box.GetMin(), box.GetMax())]
+    assert (np.ptp(ends, axis=0)[:2] < side).all()
     # The physics scenes of the assets' files stay there: a scene has one.
     assert sum(prim.GetTypeName() == "PhysicsScene" for prim in stage.Traverse()) == 1
     assert json.loads((exported / "index.json").read_text())["files"] == ["scene.usda"]
