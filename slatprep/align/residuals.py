@@ -50,10 +50,15 @@ class Residuals:
         self._pixie_rows = len(here.points)
 
     def held_out(self) -> NDArray[np.bool_]:
-        """Return whether each sample lies in a block that a trial does not see."""
+        """Return whether each sample lies in a block that a trial does not see.
+
+        It sees every block if the others have no sample of one of the sides.
+        """
         low = self.surface.points.min(axis=0) - 1.0
         blocks = np.floor((self._lines.places - low) / BLOCK).astype(np.intp)
-        return np.asarray(blocks.sum(axis=1) % 2 == 1)
+        held = np.asarray(blocks.sum(axis=1) % 2 == 1)
+        n = self._pixie_rows
+        return held & ~(held[:n].all() or held[n:].all())
 
     def linearise(self, warp: Warp, tau: float) -> None:
         """Measure all residuals, weighted by the kernel of width `tau`, and their derivatives."""

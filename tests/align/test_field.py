@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.demos import made_cases
@@ -198,6 +198,8 @@ def test_odd_shapes_get_a_finite_answer_and_a_verdict(name):
     voxels=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),
     other=st.sets(st.tuples(*[st.integers(0, 63)] * 3), min_size=1, max_size=40),
 )
+@example({(0, 0, 0)}, {(8, 1, 0), (0, 0, 7)})  # all samples of a side in held out blocks
+@example({(8, 1, 0), (0, 0, 7)}, {(0, 0, 0)})
 def test_any_two_small_sets_get_a_similarity(voxels, other):
     field, latents = field_of(occupancy_of(np.array([*voxels]))), latents_of(np.array([*other]))
     alignment = align(field, latents, DEFAULT)
