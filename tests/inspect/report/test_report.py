@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from support.commands import document
 from support.deformed import MOVES
+from support.made_store import rewrite
 from support.pages import HOSTILE, Page
 from support.synthetic import QUARTER_TURN
 
@@ -210,6 +211,14 @@ def test_of_a_store_too_large_to_list_a_sample_is_listed(hostile, page, tmp_path
     assert found["shared"] == []
     clips = [[one["clipped"] for one in content["properties"]] for content in (found, whole)]
     assert clips[0] == clips[1]
+
+
+def test_clipped_values_are_counted_in_the_field_and_in_the_slat(copy, tmp_path):
+    for name, counts in (("clipped_grid", (7, 0, 30)), ("clipped", (5, 1, 0))):
+        rewrite(copy, f"asset/{name}", 0, counts)
+    write_report(open_store(copy), tmp_path / "page.html")
+    found = Page(tmp_path / "page.html").content["properties"]
+    assert [one["clipped"] for one in found] == [[7, 5], [0, 1], [30, 0]]
 
 
 def test_nearest_quarter_turn():
