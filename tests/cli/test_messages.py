@@ -1,18 +1,15 @@
 """What commands say to somebody who meets them for the first time, and with which exit code."""
 
-import errno
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.commands import document, refused, run
+from support.commands import document, python, refused, run
+from support.faults import no_room
 from support.made_store import rewrite
 from support.predictions import write_predictions
 from support.rights import BOUND_BY_PERMISSIONS
@@ -108,10 +105,21 @@ def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use_everywhere(
     ("make-demo d --level x", 2, "expected a whole number of at least 0 and at most 7"),
     ("simulate --height x", 2, "'x' is no number; expected a number of at least 0"),
     ("build-store --jobs 0", 2, "0 is not in the range x>=1"),
+    ("build-store --jobs 2 --scheduler tcp://127.0.0.1:1 --out NEW", 2, "--jobs is for this machi"),
+    ("check-alignment --worst 2 --store STORE --picture NEW.png", 2, "need a folder"),
+    ("stats STORE --picture NEW.gif", 2, "none of .png, .svg, .pdf"),
+    ("stats STORE --category boat", 2, "boat"),
+    ("subset STORE --verdict failed --out NEW", 2,
+     "no asset of STORE is chosen; expected one at least: there are 5 good"),
+    ("build-store --slat SLAT --out NEW --pixieverse ROOT/pixeverse", 2,
+     "did you mean ROOT/pixieverse?"),
+    ("build-store --slat SLAT --out NEW --pixieverse ROOT/absent", 2, "option --pixieverse: "),
+    ("build-store --slat SLAT --out NEW --pixieverse ROOT/absent", 2,
+     "ROOT does, and holds the folders "),
 ])  # fmt: skip
 def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tmp_path):
     places = {"STORE": store, "FOLDER": tmp_path, "NEW": tmp_path / "new"}
-    places |= {"SLAT": mixed.root / "slat", "GRIDS": mixed.root / "pixieverse"}
+    places |= {"SLAT": mixed.root / "slat", "GRIDS": mixed.root / "pixieverse", "ROOT": mixed.root}
     for word, place in places.items():
         words, said = words.replace(word, str(place)), said.replace(word, str(place))
     command, *rest = words.split()
@@ -140,27 +148,13 @@ def test_no_default_is_printed_of_an_option_that_is_empty_without_it():
     assert '""' not in run("publish", "--help").stdout
 
 
-def test_a_choice_that_leaves_nothing_says_what_there_is(store, tmp_path):
-    told = refused("subset", store, "--verdict", "failed", "--out", tmp_path / "s.zarr")
-    assert f"no asset of {store} is chosen; expected one at least: there are 5 good" in told
-
-
 def test_names_that_were_looked_for_are_told_once(make_dataset, tmp_path):
     dataset = make_dataset(*"abc")
     for name in "ab":
         (dataset.root / "slat" / f"{name}.npz").unlink()
-    words = "--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat"
-    told = refused("build-store", *words, "--out", tmp_path / "s.zarr", code=1)
+    told = refused("build-store", *dataset.sides, "--out", tmp_path / "s.zarr", code=1)
     assert "a: " in told and "no SLAT for id 'b'" in told
     assert told.count("looked for") == 1
-
-
-def test_a_folder_that_is_not_there_is_told_with_those_that_are(make_dataset, tmp_path):
-    root = make_dataset("a").root
-    words = "build-store", "--slat", root / "slat", "--out", tmp_path / "s", "--pixieverse"
-    assert f"did you mean {root}/pixieverse?" in refused(*words, root / "pixeverse")
-    told = refused(*words, root / "absent")
-    assert "option --pixieverse: " in told and f"{root} does, and holds the folders " in told
 
 
 def test_a_category_with_the_name_of_another_row_is_in_quotes(store, copy, tmp_path):
@@ -255,11 +249,9 @@ def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(store, tmp_path
     shutil.copytree(store, own)
     (own / "zarr.json").chmod(0)
     script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
-    command = [sys.executable, "-c", script, "info", str(own)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "zarr.json: may not be read (Permission denied)" in done.stderr
-    assert "is not a slatprep store" not in done.stderr
+    told = python("-c", script, "info", own, code=1).stderr
+    assert "zarr.json: may not be read (Permission denied)" in told
+    assert "is not a slatprep store" not in told
 
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monkeypatch):
@@ -278,9 +270,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monke
     monkeypatch.setattr("slatprep.pipeline.dataset.build_store", built)
     monkeypatch.setattr("slatprep.learn.train.train", trained)
     monkeypatch.setattr("slatprep.demo.make_demo", made)
-    parts = mixed.parameters()
-    sources = ("--pixieverse", parts.pixieverse.root, "--slat", parts.slat.root)
-    stopped = refused("build-store", *sources, "--out", tmp_path / "new.zarr", code=130)
+    stopped = refused("build-store", *mixed.sides, "--out", tmp_path / "new.zarr", code=130)
     assert "2 of 3 assets are done and kept; the same command goes on from there" in stopped
     stopped = refused("train", store, "--out", tmp_path / "run", "--keep", "last", code=130)
     assert "epochs up to 4 are kept, and the steps since then but for the last 30 s" in stopped
@@ -295,10 +285,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monke
     "words", ["report --out", "describe --out", "check-alignment --asset ant --picture"]
 )
 def test_a_full_disk_is_a_line(store, tmp_path, monkeypatch, words):
-    def full(path: Path) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(atomic, "flush", full)
+    monkeypatch.setattr(atomic, "flush", no_room)
     line = refused(*words.split(), tmp_path / "result.png", store, code=1)
     assert "cannot be written to" in line
     assert "No space left on device" in line and "ake room" in line

@@ -12,6 +12,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import pytest
+from support.commands import python
 from support.faults import inject
 from support.synthetic import Dataset
 from support.trees import tree
@@ -63,10 +64,7 @@ def test_a_signal_at_a_step(step, number, lost, sources, tmp_path):
     out = folder / "s.zarr"
     before, there = tree(out), set(folder.iterdir())
     said = tmp_path / "said"
-    line = [
-        "build-store", "--pixieverse", str(sources.root / "pixieverse"),
-        "--slat", str(sources.root / "slat"), "--ranges", "pixie", "--out", str(out),
-    ]  # fmt: skip
+    line = [*map(str, ("build-store", *sources.sides, "--ranges", "pixie", "--out", out))]
     how = {"target": _run, "args": (step, number, line, said, lost)}
     forked = multiprocessing.get_context("fork").Process(**how)
     forked.start()
@@ -115,9 +113,8 @@ except KeyboardInterrupt:
     ],
 )
 def test_a_stop_waits_where_it_would_be_lost(call, printed):
-    line = [sys.executable, "-c", INTERRUPTED.replace("CALL", call)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
-    assert (done.stdout.split(), done.stderr, done.returncode) == (printed, "", 0)
+    done = python("-c", INTERRUPTED.replace("CALL", call))
+    assert (done.stdout.split(), done.stderr) == (printed, "")
 
 
 ENDING = """
@@ -136,9 +133,7 @@ main()
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_a_signal_while_python_ends_changes_nothing(name):
-    line = [sys.executable, "-c", ENDING.replace("SIGNAL", name)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
-    assert (done.stderr, done.returncode) == ("ended\n", 0)
+    assert python("-c", ENDING.replace("SIGNAL", name)).stderr == "ended\n"
 
 
 STARTING = """

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from support.commands import document, refused, run
+from support.commands import document, run
 from support.made_store import rewrite
 
 from slatprep import ConfigError, StoreError, open_store
@@ -277,11 +277,6 @@ def test_two_stores_are_not_mixed(store, tmp_path, jobs):
 
 
 def test_wrong_use_is_refused(store):
-    for option, value, told in (
-        ("--picture", "p.gif", "none of .png, .svg, .pdf"),
-        ("--category", "boat", "boat"),
-    ):
-        assert told in refused("stats", store, option, value)
     with pytest.raises(ConfigError, match="weight is 'zz'; expected one of voxel, asset"):
         statistics.store_statistics(store, weight="zz")  # type: ignore[arg-type]
     for filters, told in (

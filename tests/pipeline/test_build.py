@@ -248,13 +248,3 @@ def test_alignment_alone_counts_assets_and_gives_the_transforms(mixed, mixed_bui
         assert record.get("alignment") == built[asset_id].get("alignment")
         assert record.get("normalization") is None
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mixed.jsonl"]
-
-
-def test_no_store_is_built_inside_another(built):
-    """The next build of the outer one would remove it as a stray."""
-    dataset, outer = built
-    before = tree(outer)
-    for inner in (outer / "inner.zarr", outer / "asset" / "deep" / "inner.zarr"):
-        with pytest.raises(ConfigError, match=r"lies inside the store .*s\.zarr"):
-            build_store(dataset.parameters(), inner)
-    assert tree(outer) == before

@@ -234,8 +234,3 @@ def test_the_first_worker_is_waited_for():
             assert list(run_unordered(divmod, [(7, 2)], cluster)) == [(3, 1)]
         address = started.scheduler_address
     assert lines == [f"{address}: has no worker yet; waiting for the first", f"{address}: 1 worker"]
-
-
-def test_jobs_and_scheduler_exclude_each_other():
-    options = ("--jobs", 2, "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr")
-    assert "--jobs is for this machine" in run("build-store", *options, code=2).output
