@@ -15,12 +15,7 @@ from slatprep.errors import StoreError
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
-from slatprep.pipeline.decoys import (
-    allowed_decoys,
-    draw_decoys,
-    measure_errors,
-    unrelated_objects,
-)
+from slatprep.pipeline.decoys import allowed_decoys, draw_decoys, measure_errors, unrelated_objects
 from slatprep.pipeline.measured import measured_errors, told_of
 from slatprep.store import Store, open_store
 from slatprep.store.records import ERRORS, manifests_of
@@ -33,10 +28,14 @@ def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -
     return open_store(copied(Path(str(mixed_build.store)), path))
 
 
+def objects_of(store: Store) -> dict[str, str]:
+    return dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+
+
 def test_decoys_are_of_other_objects_and_are_aligned_once(store):
     aligned: list[tuple[int, ...]] = []
     first = measure_errors(store, decoys=3, seed=1, progress=lambda *at: aligned.append(at))
-    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    objects = objects_of(store)
     assert len(first.decoys) == 3
     assert aligned == [(1, 3), (2, 3), (3, 3)]
     assert all(objects[one.grid] != objects[one.slat] for one in first.decoys)
@@ -55,7 +54,7 @@ def test_decoys_are_drawn_by_ids_and_seed_with_the_slat_of_the_nearest_size(stor
         one.grid for one in drawn
     ]
     sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
-    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    objects = objects_of(store)
     for one in drawn:
         others = [other for other in store.ids if objects[other] != objects[one.grid]]
         nearest = min(abs(sizes[other] - sizes[one.grid]) for other in others)
@@ -88,7 +87,7 @@ def test_each_object_has_a_decoy_before_any_has_two_and_meets_no_other_twice(
     dataset.add("d", 3, views=("front", "side", "top", "back", "left"))
     build_store(dataset.parameters(), out)
     store = open_store(out)
-    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    objects = objects_of(store)
     own = unrelated_objects(store, decoys._evidence_of(store)[1])
     for seed in range(6):
         drawn = draw_decoys(store, dict.fromkeys(store.ids, ""), own, 99, seed)

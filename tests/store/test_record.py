@@ -20,12 +20,7 @@ from slatprep.store import open_store
 from slatprep.store.attributes import RootAttributes, read_attributes, segments_of, width_findings
 from slatprep.store.layout import RECORDS_IN_CHUNK
 from slatprep.store.record import AssetRecord, BuildRecord, FailedRecord
-from slatprep.store.record_json import (
-    FOLDER,
-    RecordError,
-    read_record,
-    to_json,
-)
+from slatprep.store.record_json import FOLDER, RecordError, read_record, to_json
 from slatprep.store.records import StoredRecords
 
 

@@ -9,7 +9,6 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -407,13 +406,9 @@ def merged(make_dataset: MakeDataset, tmp_path: Path) -> BuildSummary:
         for sample, factor in enumerate(factors):
             grid = dataset.assets[name].grid.copy()
             grid[grid[..., 3] != 7, 1] *= factor
-            path = dataset.root / "pixieverse" / name / f"sample_{sample}" / "material_grid.npy"
-            path.parent.mkdir(exist_ok=True)
-            np.save(path, grid)
+            dataset.write_grid(name, grid, sample)
     (dataset.root / "pixieverse/b/sample_2/material_grid.npy").write_bytes(b"torn")
-    parameters = dataset.parameters()
-    source = replace(parameters.pixieverse, samples="merge")
-    return build_store(replace(parameters, pixieverse=source), tmp_path / "s.zarr")
+    return build_store(dataset.parameters(pixieverse={"samples": "merge"}), tmp_path / "s.zarr")
 
 
 def test_assets_say_how_many_annotations_agree(merged, browser, tmp_path):

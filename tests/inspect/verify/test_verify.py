@@ -336,10 +336,8 @@ def test_what_build_json_says_of_the_store_is_compared(store):
 
 
 def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
-    parameters = mixed.parameters()
-    roots = SourceRoots(tmp_path / "pixieverse", tmp_path / "slat")
-    shutil.copytree(parameters.pixieverse.root, roots.pixieverse)
-    shutil.copytree(parameters.slat.root, roots.slat)
+    own = Path(shutil.copytree(mixed.root, tmp_path / "own"))
+    roots = SourceRoots(own / "pixieverse", own / "slat")
     result = verify_store(store, sources=True, roots=roots)
     assert result.ok
     assert result.sources == 10
@@ -354,9 +352,8 @@ def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
 
 
 def test_a_second_look_remembers_nothing_of_the_first(store, mixed, tmp_path):
-    parameters = mixed.parameters()
-    roots = SourceRoots(parameters.pixieverse.root, tmp_path / "slat")
-    shutil.copytree(parameters.slat.root, roots.slat)
+    roots = SourceRoots(mixed.root / "pixieverse", tmp_path / "slat")
+    shutil.copytree(mixed.root / "slat", roots.slat)
     assert verify_store(store, roots=roots, sources=True).ok
     slat = roots.slat / "ant.npz"
     times = slat.stat().st_atime_ns, slat.stat().st_mtime_ns
