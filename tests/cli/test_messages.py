@@ -48,9 +48,7 @@ def of_kinds(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("subset", "STORE", "--asset", "NOBODY", "--out", "OUT"),
     ("transfer", "POINTS", "--store", "STORE", "--asset", "NOBODY", "--out", "OUT"),
 ])  # fmt: skip
-def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use_everywhere(
-    words, store, tmp_path
-):
+def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use(words, store, tmp_path):
     np.save(tmp_path / "p.npy", np.zeros((3, 3), np.float32))
     places = {"STORE": store, "OUT": tmp_path / "out", "POINTS": tmp_path / "p.npy"}
     for name, said in (
@@ -315,9 +313,7 @@ def test_records_that_make_left_are_found(mixed_build, deformed_build, tmp_path,
     assert "no records of data/demo.zarr found" in run("report", store).output
 
 
-def test_records_of_the_store_s_build_are_taken_and_other_ones_named(
-    mixed_build, deformed_build, tmp_path, monkeypatch
-):
+def test_records_of_another_build_are_named(mixed_build, deformed_build, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     store = Path(shutil.copytree(str(mixed_build.store), "data/demo.zarr"))
     shutil.copytree(deformed_build.records.parent, "data/demo.manifests")

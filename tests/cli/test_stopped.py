@@ -103,15 +103,12 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize(
-    ("call", "printed"),
-    [
-        ("interrupted()", ["stopped"]),
-        # Python drops what a destructor raises, and zarr's thread would go on writing.
-        ("Gone()", ["ended", "stopped"]),
-        ("library['call']()", ["ended", "stopped"]),
-    ],
-)
+@pytest.mark.parametrize(("call", "printed"), [
+    ("interrupted()", ["stopped"]),
+    # Python drops what a destructor raises, and zarr's thread would go on writing.
+    ("Gone()", ["ended", "stopped"]),
+    ("library['call']()", ["ended", "stopped"]),
+])  # fmt: skip
 def test_a_stop_waits_where_it_would_be_lost(call, printed):
     done = python("-c", INTERRUPTED.replace("CALL", call))
     assert (done.stdout.split(), done.stderr) == (printed, "")

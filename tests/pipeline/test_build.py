@@ -86,16 +86,13 @@ def test_folders_instead_of_parameters_are_answered_with_what_to_give(tmp_path):
         build_store("grids", tmp_path / "s.zarr")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("group", "wrong", "said"),
-    [
-        ("align", {"engine": "zz"}, r"align\.engine: got 'zz'; expected 'field'"),
-        ("store", {"voxel_chunk": 0}, r"store\.voxel_chunk: got 0; expected greater than 0"),
-        ("sample", {"max_distance": np.nan}, r"sample\.max_distance: got nan"),
-        ("pixieverse", {"samples": "some"}, r"pixieverse\.samples: got 'some'"),
-        ("slat", {"root": None}, r"slat\.root: got None"),
-    ],
-)
+@pytest.mark.parametrize(("group", "wrong", "said"), [
+    ("align", {"engine": "zz"}, r"align\.engine: got 'zz'; expected 'field'"),
+    ("store", {"voxel_chunk": 0}, r"store\.voxel_chunk: got 0; expected greater than 0"),
+    ("sample", {"max_distance": np.nan}, r"sample\.max_distance: got nan"),
+    ("pixieverse", {"samples": "some"}, r"pixieverse\.samples: got 'some'"),
+    ("slat", {"root": None}, r"slat\.root: got None"),
+])  # fmt: skip
 def test_senseless_parameters_are_refused_at_each_door(make_dataset, tmp_path, group, wrong, said):
     parameters = make_dataset().parameters(**{group: wrong})
     for door in (build_store, plan_build, align_pairs):

@@ -80,9 +80,7 @@ def test_pairs_that_share_a_slat_or_a_grid_are_no_decoys(make_dataset, tmp_path)
     assert "decoys need two objects that share neither grid nor SLAT" in said
 
 
-def test_each_object_has_a_decoy_before_any_has_two_and_meets_no_other_twice(
-    make_dataset, tmp_path
-):
+def test_each_object_has_a_decoy_before_any_has_two(make_dataset, tmp_path):
     dataset, out = make_dataset("a", "b", "c"), tmp_path / "s.zarr"
     dataset.add("d", 3, views=("front", "side", "top", "back", "left"))
     build_store(dataset.parameters(), out)
@@ -229,9 +227,7 @@ def test_a_decoy_not_aligned_costs_no_build(make_dataset, tmp_path, monkeypatch,
 
 
 @pytest.mark.usefixtures("few_suffice")
-def test_a_fault_of_slatprep_s_own_is_raised_though_the_store_is_there(
-    make_dataset, tmp_path, monkeypatch
-):
+def test_a_fault_of_our_own_is_raised_though_there_is_a_store(make_dataset, tmp_path, monkeypatch):
     def faulty(*task: object) -> None:
         raise TypeError("not callable")
 

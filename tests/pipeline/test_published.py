@@ -252,9 +252,7 @@ COMMENT = header(30, tarfile.XHDTYPE) + b"30 comment=aaaaaaaaaaaaaaaaaa\n".ljust
 ], ids=[
     "negative", "huge", "negative by pax", "nested", "large", "long name", "no header", "cut",
 ])  # fmt: skip
-def test_strange_headers_end_one_archive_alone(
-    objects, made, strange, tmp_path, suffix, behind, said
-):
+def test_strange_headers_end_one_archive(objects, made, strange, tmp_path, suffix, behind, said):
     pack(strange / "a.tar", [objects / IDS[0]])
     pack(tmp_path / "b", [objects / IDS[1]])
     with tarfile.open(tmp_path / "b") as archive:
@@ -270,9 +268,7 @@ def test_strange_headers_end_one_archive_alone(
     assert open_store(tmp_path / "s.zarr").ids == [IDS[0], IDS[1]]
 
 
-def test_nothing_is_taken_from_a_gzip_archive_whose_checksum_is_wrong(
-    objects, made, strange, tmp_path
-):
+def test_a_gzip_archive_of_a_wrong_checksum_gives_nothing(objects, made, strange, tmp_path):
     pack(strange / "a.tar", [objects / IDS[0]])
     path = strange / "b.tar.gz"
     pack(path, [objects / IDS[1]])

@@ -420,15 +420,12 @@ def test_joined_and_chosen_stores_keep_their_spread(merged, tmp_path):
     assert verify_store(tmp_path / "joined.zarr").findings == ()
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"properties": [DENSITY | {"unit": "g/cm^3"}]}, "density in g/cm^3, log10"),
-        ({"properties": [DENSITY | {"scale": "linear"}]}, "density in kg/m^3, linear"),
-        ({"properties": [DENSITY | {"name": "damping"}]}, "the property damping, which"),
-        ({"classes": ["wood", "steel"]}, "the classes wood, steel"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"properties": [DENSITY | {"unit": "g/cm^3"}]}, "density in g/cm^3, log10"),
+    ({"properties": [DENSITY | {"scale": "linear"}]}, "density in kg/m^3, linear"),
+    ({"properties": [DENSITY | {"name": "damping"}]}, "the property damping, which"),
+    ({"classes": ["wood", "steel"]}, "the classes wood, steel"),
+])  # fmt: skip
 def test_tables_that_disagree_are_refused(own, tmp_path, changes, words):
     describe(own.root, **changes)
     with pytest.raises(ConfigError, match=r"\[\[also\]\] 1") as error:

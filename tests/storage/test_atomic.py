@@ -66,16 +66,13 @@ def refused(target: Path, fresh: bool = False) -> str:
 AS_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="gives something away")
 
 
-@pytest.mark.parametrize(
-    ("how", "told"),
-    [
-        ("link", ".s.zarr.work: is no folder"),
-        ("made by others", "holds notes.txt"),
-        pytest.param("another user's", "belongs to user 12345", marks=AS_ROOT),
-        ("spool is a link", "spool: is no folder"),
-        ("spool is a file", "spool: is no folder"),
-    ],
-)
+@pytest.mark.parametrize(("how", "told"), [
+    ("link", ".s.zarr.work: is no folder"),
+    ("made by others", "holds notes.txt"),
+    pytest.param("another user's", "belongs to user 12345", marks=AS_ROOT),
+    ("spool is a link", "spool: is no folder"),
+    ("spool is a file", "spool: is no folder"),
+])  # fmt: skip
 def test_a_work_folder_that_is_not_a_builds_own_is_refused(tmp_path, theirs, how, told):
     work = tmp_path / ".s.zarr.work"
     if how == "link":

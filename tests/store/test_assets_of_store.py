@@ -165,20 +165,17 @@ def test_an_asset_is_found_by_a_beginning_that_no_other_has(made):
     assert "cu" not in store and 3 not in store
 
 
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [
-        ("bear", r"did you mean bear\.front or bear\.side\?"),
-        ("be", r"2 ids begin with 'be', such as bear\.front, bear\.side; give more of it"),
-        ("BEAR.F", r"did you mean bear\.front\?"),
-        ("cupp", r"did you mean cup\?"),
-        ("", "has no asset ''; it has 4 assets"),
-        ("zebra", "it has 4 assets"),
-        ("4", "has no asset 4; it has 4 assets, numbered from 0"),
-        (4, "has no asset 4; it has 4 assets, numbered from 0"),
-        (-5, "has no asset -5"),
-    ],
-)
+@pytest.mark.parametrize(("name", "hint"), [
+    ("bear", r"did you mean bear\.front or bear\.side\?"),
+    ("be", r"2 ids begin with 'be', such as bear\.front, bear\.side; give more of it"),
+    ("BEAR.F", r"did you mean bear\.front\?"),
+    ("cupp", r"did you mean cup\?"),
+    ("", "has no asset ''; it has 4 assets"),
+    ("zebra", "it has 4 assets"),
+    ("4", "has no asset 4; it has 4 assets, numbered from 0"),
+    (4, "has no asset 4; it has 4 assets, numbered from 0"),
+    (-5, "has no asset -5"),
+])  # fmt: skip
 def test_a_name_that_none_or_several_have_is_answered(made, name, hint):
     store, _ = made
     with pytest.raises(UnknownAssetError, match=hint):

@@ -310,9 +310,7 @@ def test_an_asset_without_a_picture_says_why_it_is_not_there(opened):
     assert_quiet(opened)
 
 
-def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
-    browser, deformed_build, tmp_path
-):
+def test_a_deformed_asset_is_found_and_shown_through_its_map(browser, deformed_build, tmp_path):
     open_page(browser, page_of(deformed_build, tmp_path / "page.html"))
     assert set(rows(browser)) == {"bent", "long"}
     click(browser, "[data-sort=model]")
