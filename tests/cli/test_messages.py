@@ -212,8 +212,7 @@ def test_quiet_commands_that_make_something_print_nothing(store, tmp_path):
 
 
 def test_sources_of_a_joined_store_are_said_to_lie_apart(store, mixed, tmp_path):
-    other = Dataset(tmp_path / "other")
-    other.add("elk", seed=8)
+    other = Dataset(tmp_path / "other").having("elk", seed=8)
     pixieverse = other.root / "pixieverse"
     build_store(other.parameters(), tmp_path / "elk.zarr")
     both = tmp_path / "both.zarr"
@@ -242,12 +241,10 @@ def test_documents_begin_alike_and_say_which_store_as_it_was_typed(store, monkey
     assert told["info"]["files"] == told["verify"]["files"] == files
 
 
-def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(store, tmp_path):
-    own = tmp_path / "s.zarr"
-    shutil.copytree(store, own)
-    (own / "zarr.json").chmod(0)
+def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(copy):
+    (copy / "zarr.json").chmod(0)
     script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
-    told = python("-c", script, "info", own, code=1).stderr
+    told = python("-c", script, "info", copy, code=1).stderr
     assert "zarr.json: may not be read (Permission denied)" in told
     assert "is not a slatprep store" not in told
 

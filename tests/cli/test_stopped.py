@@ -45,8 +45,7 @@ def _run(step: str, number: signal.Signals, line: list[str], said: Path, lost: b
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """One asset, and in a folder the store of another, with its records."""
-    old = Dataset(tmp_path_factory.mktemp("old"))
-    old.add("z", seed=3)
+    old = Dataset(tmp_path_factory.mktemp("old")).having("z", seed=3)
     made = Dataset(tmp_path_factory.mktemp("made")).having("a")
     build_store(old.parameters("pixie"), made.root / "stores" / "s.zarr")
     return made

@@ -24,9 +24,8 @@ def kept(undisturbed: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "predictions" / "a.npz").write_bytes(b"")
     np.save(folder / "p.npy", np.zeros((4, 3)))
     (folder / "ids.json").write_text("{}")
-    (folder / "d.toml").write_text(
-        '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
-    )
+    definition = '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
+    (folder / "d.toml").write_text(definition)
     return folder
 
 

@@ -237,11 +237,9 @@ def test_categories_that_share_a_name_with_other_rows_have_rows_of_their_own(sto
 
 def test_the_legend_of_many_classes_names_the_commonest(store):
     found = statistics.store_statistics(open_store(store))
-    sizes = [0, 5, 2, 9, *range(10, 40)]
+    first, sizes = found.classes[0], [0, 5, 2, 9, *range(10, 40)]
     made = [
-        replace(
-            found.classes[0], name=f"class {k}", field=replace(found.classes[0].field, voxels=n)
-        )
+        replace(first, name=f"class {k}", field=replace(first.field, voxels=n))
         for k, n in enumerate(sizes)
     ]
     picture = draw_statistics(open_store(store), replace(found, classes=tuple(made)), "svg")

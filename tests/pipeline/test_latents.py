@@ -111,9 +111,8 @@ def test_mixed_latents_are_counted_but_none_of_little_spread(make_dataset, tmp_p
         dataset = make_dataset(*names)
         for name, asset in dataset.assets.items():
             standard = (asset.feats - MEAN) / STD * np.float32(spread.get(name, 1.0))
-            dataset.write_slat(
-                f"{name}.npz", asset.coords, asset.feats if name in raw else standard
-            )
+            feats = asset.feats if name in raw else standard
+            dataset.write_slat(f"{name}.npz", asset.coords, feats)
         told = build_store(dataset.parameters(), tmp_path / f"{names}.zarr").warnings
         return next(text for text in told if "unlike the others" in text)
 

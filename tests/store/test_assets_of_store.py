@@ -238,11 +238,9 @@ def test_a_field_has_the_annotated_cells_in_si_units(made):
     assert field.voxels.tolist() == [list(cell) for cell in cells]
     assert field.material.tolist() == [material[cell] for cell in cells]
     values = np.array([properties[:, *cell] for cell in cells], np.float64)
-    share = (values + 1) / 2
+    first, second, third = (values.T + 1) / 2
     # Ranges [2, 5], [3, 7] and [4, 9], the first two of log10.
-    expected = np.stack(
-        [10 ** (2 + 3 * share[:, 0]), 10 ** (3 + 4 * share[:, 1]), 4 + 5 * share[:, 2]], axis=1
-    )
+    expected = np.stack([10 ** (2 + 3 * first), 10 ** (3 + 4 * second), 4 + 5 * third], axis=1)
     np.testing.assert_allclose(field.properties, expected, rtol=1e-5)
     assert np.array_equal(store.asset("bear.side").normalised_field.properties, values)
     # What is occupied but not annotated is a part of the shape.

@@ -129,9 +129,8 @@ def test_text_that_is_no_json_is_refused():
 def test_what_is_unusual_of_a_merged_annotation_names_it():
     warnings = ["sample 2: unusual values: class sand has\n3 Pa", "unusual values: other", "a word"]
     assert oddities_in(warnings) == {"values": "sample 2: class sand has 3 Pa"}
-    assert oddities_in(["sample 0 has no unusual masks: none", "unusual masks: b"]) == {
-        "masks": "b"
-    }
+    masks = ["sample 0 has no unusual masks: none", "unusual masks: b"]
+    assert oddities_in(masks) == {"masks": "b"}
 
 
 def test_nan_is_null(record):

@@ -107,9 +107,7 @@ def test_chunks_are_held_that_have_the_same_bytes(drawn, size):
 @given(drawn=arrays_and_runs(), chunk=st.integers(1, 4), chunks=st.integers(1, 4))
 def test_shards_are_pieced_together_from_what_is_the_same(drawn, chunk, chunks):
     old, new, runs = drawn
-    parameters = StoreParameters(
-        voxel_chunk=chunk, voxel_chunks_per_shard=chunks, grid_assets_per_shard=1
-    )
+    parameters = StoreParameters(chunk, chunks, grid_assets_per_shard=1)
     cut = [
         shard
         for shard in shards(["a"], [0, len(new)], parameters, {"voxel": runs}, {("voxel", 0)})

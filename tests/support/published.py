@@ -26,13 +26,11 @@ def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     archive.addfile(member, io.BytesIO(data))
 
 
-def add_link(
-    archive: tarfile.TarFile, name: str, target: str, kind: bytes = tarfile.LNKTYPE
-) -> None:
+def add_link(tar: tarfile.TarFile, name: str, target: str, kind: bytes = tarfile.LNKTYPE) -> None:
     """Add a link to an archive, or a member of another kind that has no data."""
     member = tarfile.TarInfo(name)
     member.type, member.linkname = kind, target
-    archive.addfile(member)
+    tar.addfile(member)
 
 
 def write_object(folder: Path, grid: np.ndarray, seed: int = 0) -> None:

@@ -21,14 +21,10 @@ from support.made_store import rewrite
 from support.synthetic import QUARTER_TURN
 from support.trees import tree
 
+from slatprep import apply_transform, open_store, voxel_centres
 from slatprep.align.starts import euler_starts
 from slatprep.errors import StoreError
-from slatprep.geometry.frames import (
-    apply_transform,
-    invert_transform,
-    make_transform,
-    voxel_centres,
-)
+from slatprep.geometry.frames import invert_transform, make_transform
 from slatprep.inspect.check import AlignmentCheck, check_alignment, choose_assets
 from slatprep.inspect.pictures import canvas
 from slatprep.inspect.pictures.alignment import HEIGHT, PANEL, WIDTH, draw_alignment, panels
@@ -37,7 +33,6 @@ from slatprep.inspect.pictures.viewer import cube_mesh, has_screen, meshes
 from slatprep.inspect.pictures.voxels import View
 from slatprep.inspect.pictures.write import write_pictures
 from slatprep.records import Alignment, Candidate, Placement, Search
-from slatprep.store import open_store
 from slatprep.store.records import StoredRecords
 
 
@@ -145,17 +140,15 @@ def test_the_start_that_was_taken_is_marked_though_another_fits_better(copy):
     turn = euler_starts()[3]  # By 270 degrees about z.
     starts = tuple(Candidate(s.index, s.euler_degrees, 0.9, 0.5, s.same_as) for s in euler_starts())
     starts = (replace(starts[0], fitness=0.95), *starts[1:])
-    moved = replace(
-        alignment, search=Search.EULER64, candidates=starts, transform=make_transform(turn.rotation)
-    )
+    there = make_transform(turn.rotation)
+    moved = replace(alignment, search=Search.EULER64, candidates=starts, transform=there)
     with canvas.styled():
         figure = draw_alignment(one, check, "t", "s", moved)
         axes = figure.axes[-1]
         (tick,) = axes.get_xticks()
         assert [text.get_text() for text in axes.get_xticklabels()] == ["start at 0°, 0°, 270°"]
-    marked = [
-        k for k, bar in enumerate(axes.patches) if bar.get_facecolor() == to_rgba(canvas.ACCENT)
-    ]
+    accent = to_rgba(canvas.ACCENT)
+    marked = [k for k, bar in enumerate(axes.patches) if bar.get_facecolor() == accent]
     assert marked == [tick] and tick > 0
 
 

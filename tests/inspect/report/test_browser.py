@@ -208,12 +208,11 @@ def test_a_reason_is_shown_without_its_path(browser, mixed_build, tmp_path):
 
 
 def test_each_line_of_reasons_shows_its_own_assets(browser, copy, tmp_path):
-    why = {"reasons": ["only 51.4% of the labels can be expected to be right"]}
+    why = ["only 51.4% of the labels can be expected to be right"]
     for row, verdict in enumerate(("doubtful", "failed", "failed")):
         rewrite(copy, "asset/verdict", row, verdict)
-        edit_record(
-            copy, row, lambda one, verdict=verdict: one["judgement"].update(why, verdict=verdict)
-        )
+        said = {"reasons": why, "verdict": verdict}
+        edit_record(copy, row, lambda one, said=said: one["judgement"].update(said))
     page = Report(copy, Path(str(manifests_of(copy))), tmp_path / "page.html")
     write_report(open_store(copy), page.path, manifests=page.manifests)
     open_page(browser, page)
@@ -333,14 +332,13 @@ def test_a_deformed_asset_is_found_and_shown_through_its_map(browser, deformed_b
     assert_quiet(browser)
 
 
-def test_tied_placements_are_stepped_through(browser, mixed_build, tmp_path):
-    store = Path(shutil.copytree(mixed_build.store, tmp_path / "mixed.zarr"))
+def test_tied_placements_are_stepped_through(browser, copy, tmp_path):
     turned = np.diag([-1.0, -1.0, 1.0, 1.0]).tolist()
     placements = [{"transform": turned, "score": 1.0, "displacement": 40.0}]
-    row = open_store(store).ids.index("cup")
-    edit_record(store, row, lambda record: record["alignment"].update(placements=placements))
+    row = open_store(copy).ids.index("cup")
+    edit_record(copy, row, lambda record: record["alignment"].update(placements=placements))
     path = tmp_path / "page.html"
-    write_report(open_store(store), path, manifests=mixed_build.records.parent)
+    write_report(open_store(copy), path, manifests=manifests_of(copy))
     browser.get("about:blank")
     browser.get(f"{path.as_uri()}#asset=cup")
     pixels = drawn(browser)
