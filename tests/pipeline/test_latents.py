@@ -117,8 +117,7 @@ def test_mixed_latents_are_counted_but_none_of_little_spread(make_dataset, tmp_p
         return next(text for text in told if "unlike the others" in text)
 
     assert "4 of 9 assets (f, g, h and 1 more) look standard" in unlike("abcdefghi", "abcde", {})
-    said = unlike("abcdef", "f", {"b": 0.4})
-    assert "1 of 9 assets (f) look as the encoder gives them" in said
+    assert "1 of 9 assets (f) look as the encoder gives them" in unlike("abcdef", "f", {"b": 0.4})
 
 
 def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path):

@@ -355,8 +355,7 @@ def test_what_lies_beside_archives_and_is_not_read_is_told(objects, made, strang
 
 @pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
 def test_a_link_to_a_file_that_no_pattern_names(objects, made, strange, tmp_path, suffix):
-    path = strange / f"tree{suffix}"
-    with writing(path) as archive:
+    with writing(strange / f"tree{suffix}") as archive:
         add(archive, f"{IDS[0]}/other.npy", grid_of(objects, 0).read_bytes())
         add_link(archive, f"{IDS[0]}/sample_0/material_grid.npy", f"{IDS[0]}/other.npy")
     (pair,) = [one for one in discover(parameters(made, strange)) if one.grid]

@@ -68,8 +68,7 @@ def test_ranges_of_the_objects_to_train_on(make_dataset, tmp_path, ranges, bound
     dataset, out = noisy(make_dataset(*"abc")), tmp_path / "s.zarr"
     lists = tmp_path / "lists.json"
     lists.write_text(json.dumps({"train": ["a", "b"], "test": ["c"]}))
-    how = {"objects": "train", "split_by": str(lists)}
-    chosen = dataset.parameters(ranges, normalize=how)
+    chosen = dataset.parameters(ranges, normalize={"objects": "train", "split_by": str(lists)})
     summary = build_store(chosen, out)
     np.testing.assert_allclose(ranges_of(out), expected(dataset, "ab", *bounds), rtol=1e-12)
     source = open_store(out).normalization.source
@@ -116,8 +115,7 @@ def test_by_hash_the_training_s_own_objects_count(make_dataset, tmp_path):
     names = "abcdef"
     dataset, out = noisy(make_dataset(*names)), tmp_path / "s.zarr"
     shares = (0.5, 0.25, 0.25)
-    how = {"objects": "train", "shares": shares}
-    build_store(dataset.parameters("p1-p99", normalize=how), out)
+    build_store(dataset.parameters("p1-p99", normalize={"objects": "train", "shares": shares}), out)
     trained = "".join(assign_store(open_store(out), "hash", Shares(*shares)).lists()["train"])
     assert 0 < len(trained) < len(names)
     np.testing.assert_allclose(ranges_of(out), expected(dataset, trained, 1, 99), rtol=1e-12)
@@ -135,8 +133,7 @@ def test_a_single_value_gets_a_width(make_dataset, tmp_path):
 
 def test_lists_and_ranges_of_no_use_are_told_before_any_work(make_dataset, tmp_path, steps):
     dataset, lists = make_dataset("a", "b"), tmp_path / "lists.json"
-    how = {"objects": "train", "split_by": str(lists)}
-    chosen = dataset.parameters("p1-p99", normalize=how)
+    chosen = dataset.parameters("p1-p99", normalize={"objects": "train", "split_by": str(lists)})
     for text, parameters, error, told in (
         ('{"train": ["a"]', chosen, InputError, "cannot be read"),
         ('{"train": ["nobody"]}', chosen, InputError, "none of the dataset's"),

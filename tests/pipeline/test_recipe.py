@@ -98,8 +98,7 @@ def test_numbers_beside_a_module_count(tmp_path, monkeypatch):
         numbers.write_text(text)
         digests.append(code_fingerprint.__wrapped__())
     assert len(set(digests)) == 3
-    shipped = numeric_modules()["slatprep.judge.calibration"]
-    assert shipped.with_suffix(".json") == NUMBERS
+    assert numeric_modules()["slatprep.judge.calibration"].with_suffix(".json") == NUMBERS
     assert NUMBERS.is_file()
 
 

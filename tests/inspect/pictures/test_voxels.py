@@ -72,8 +72,7 @@ def test_a_moved_set_looks_like_the_set_that_was_moved():
 
 def test_what_lies_outside_the_picture_is_left_out():
     far = make_transform(np.eye(3), (3.0, 0.0, 0.0))
-    drawing = draw_voxels(np.array([[0, 0, 0]]), np.array([RED]), far, FRONT)
-    assert drawing.cover.sum() == 0
+    assert draw_voxels(np.array([[0, 0, 0]]), np.array([RED]), far, FRONT).cover.sum() == 0
     nothing = draw_voxels(np.empty((0, 3), np.uint8), np.empty((0, 3)), np.eye(4), FRONT)
     assert (nothing.rgb == 1).all()
 

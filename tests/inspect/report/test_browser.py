@@ -9,6 +9,7 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,6 @@ from support.synthetic import Dataset, MakeDataset
 
 from slatprep.inspect.report import write_report
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
 from slatprep.store.records import manifests_of
@@ -243,8 +243,7 @@ def test_it_opens_an_asset_that_turns(opened):
     from selenium.webdriver.common.keys import Keys
 
     click(opened, "[data-sort=id]")
-    row = opened.find_element("css selector", "tbody tr:not(.space)")
-    row.send_keys(Keys.ARROW_DOWN)
+    opened.find_element("css selector", "tbody tr:not(.space)").send_keys(Keys.ARROW_DOWN)
     opened.switch_to.active_element.send_keys(Keys.ENTER)
     title = opened.find_element("id", "asset-title")
     assert title.text.startswith("bear.front")
@@ -482,12 +481,9 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Report:
     kinds = (HOSTILE, "__proto__", f"{HOSTILE}\u2028`${{window.broken = 1}}")
     categories = {name: {"obj_class": kind} for name, kind in zip(SOUND, kinds, strict=True)}
     (root / "categories.json").write_text(json.dumps(categories))
-    parameters = BuildParameters(
-        PixieverseSource(root / "voxels", adapter="voxels"),
-        SlatSource(root / "slat"),
-        pairing=PairingParameters(categories=root / "categories.json"),
-        name=HOSTILE,
-    )
+    source = {"root": root / "voxels", "adapter": "voxels"}
+    pairing = {"categories": root / "categories.json"}
+    parameters = replace(dataset.parameters(pixieverse=source, pairing=pairing), name=HOSTILE)
     summary = build_store(parameters, root / f"{IN_NAMES}.zarr")
     assert summary.statuses["ok"] == len(SOUND)
     assert verify_store(root / f"{IN_NAMES}.zarr", sources=True).findings == ()

@@ -344,8 +344,7 @@ def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
     grid, slat = roots.pixieverse / "ant/sample_0/material_grid.npy", roots.slat / "cup.npz"
     flip(grid, 1000)
     slat.unlink()
-    findings = found(store, sources=True, roots=roots)
-    assert [(f.file, f.asset, f.what) for f in findings] == [
+    assert [(f.file, f.asset, f.what) for f in found(store, sources=True, roots=roots)] == [
         (str(grid), "ant", "its bytes changed"),
         (str(slat), "cup", "does not exist"),
     ]
