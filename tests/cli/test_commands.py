@@ -14,11 +14,10 @@ import pytest
 from support.commands import document, parse_command, python, refused, run
 from support.trees import tree
 
+from slatprep import ConfigError, open_store
 from slatprep.cli.commands import COMMANDS
-from slatprep.errors import ConfigError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import PRESETS, BuildParameters
-from slatprep.store import open_store
 
 THREE_ASSETS = ("--assets", "3", "--seed", "3", "--level", "0")
 

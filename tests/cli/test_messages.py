@@ -15,12 +15,11 @@ from support.predictions import write_predictions
 from support.rights import BOUND_BY_PERMISSIONS
 from support.synthetic import Dataset
 
-from slatprep import open_store
+from slatprep import build_store, open_store
 from slatprep.cli.info import show_quality
 from slatprep.cli.output import Output
 from slatprep.inspect.overview import overview_of
 from slatprep.learn.runs import EpochRecord
-from slatprep.pipeline.dataset import build_store
 from slatprep.storage import atomic
 from slatprep.storage.place import place_of
 from slatprep.store.integrity import digests_in

@@ -13,7 +13,7 @@ import zarr
 from support.commands import document, run
 from support.made_store import rewrite
 
-from slatprep import ConfigError, StoreError, open_store
+from slatprep import MATERIAL_CLASSES, ConfigError, StoreError, open_store
 from slatprep.cli.output import as_json
 from slatprep.inspect import statistics
 from slatprep.inspect.check import check_alignment
@@ -21,7 +21,6 @@ from slatprep.inspect.overview import overview_of
 from slatprep.inspect.pictures.statistics import draw_statistics
 from slatprep.pipeline.dataset import BuildSummary
 from slatprep.pipeline.rows import SourceStore
-from slatprep.records import MATERIAL_CLASSES
 from slatprep.workers.local import run_in_order
 
 CATEGORIES = ["b", "", "a", "=b", "b"]

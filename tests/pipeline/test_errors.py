@@ -11,13 +11,12 @@ import pytest
 from support.commands import document, run
 from support.trees import copied, tree
 
-from slatprep.errors import StoreError
+from slatprep import Store, StoreError, open_store
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.pipeline.decoys import allowed_decoys, draw_decoys, measure_errors, unrelated_objects
 from slatprep.pipeline.measured import measured_errors, told_of
-from slatprep.store import Store, open_store
 from slatprep.store.records import ERRORS, manifests_of
 
 

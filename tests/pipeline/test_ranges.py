@@ -8,9 +8,8 @@ import pytest
 from support.synthetic import Dataset
 from support.trees import tree
 
-from slatprep import ConfigError, InputError, build_store, open_store
+from slatprep import PROPERTY_COLUMNS, ConfigError, InputError, build_store, open_store
 from slatprep.inspect.verify import verify_store
-from slatprep.records import PROPERTY_COLUMNS
 from slatprep.store.record import BuildRecord
 from slatprep.store.record_json import read_record
 

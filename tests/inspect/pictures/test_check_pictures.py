@@ -21,9 +21,8 @@ from support.made_store import rewrite
 from support.synthetic import QUARTER_TURN
 from support.trees import tree
 
-from slatprep import apply_transform, open_store, voxel_centres
+from slatprep import StoreError, apply_transform, open_store, voxel_centres
 from slatprep.align.starts import euler_starts
-from slatprep.errors import StoreError
 from slatprep.geometry.frames import invert_transform, make_transform
 from slatprep.inspect.check import AlignmentCheck, check_alignment, choose_assets
 from slatprep.inspect.pictures import canvas

@@ -14,11 +14,9 @@ from support.faults import flip
 from support.made_store import edit_json, edit_record, placed, rewrite
 from support.shapes import surface_latents
 
-from slatprep.errors import StoreError
+from slatprep import StoreError, build_store, open_store
 from slatprep.inspect.verify import Finding, SourceRoots, index_findings, verify_store
 from slatprep.inspect.verify.manifests import manifest_findings
-from slatprep.pipeline.dataset import build_store
-from slatprep.store import open_store
 
 
 @pytest.fixture
