@@ -7,7 +7,6 @@ import json
 import os
 import re
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from PIL import Image
+from support.faults import wait_until
 from support.made_store import edit_record, rewrite
 from support.pages import HOSTILE, Page, Report
 from support.synthetic import Dataset, MakeDataset
@@ -33,21 +33,12 @@ pytest.importorskip("selenium")
 
 LIBRARY = '<script type="text/plain" id="library">'
 
-PATIENCE = 600  # A loaded machine draws 3D slowly without a graphics card.
-
-
-def wait(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "the page did not get there"
-        time.sleep(0.05)
-
 
 def open_page(browser: Chrome, report: Report, end: str = "") -> None:
     browser.get("about:blank")  # else a change of the address' end loads nothing
     browser.get(report.path.as_uri() + end)
     ready = "return performance.getEntriesByName('slatprep-ready').length"
-    wait(lambda: browser.execute_script(ready))
+    wait_until(lambda: browser.execute_script(ready))
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +104,7 @@ def drawn(browser: Chrome) -> Callable[[], bytes]:
     def pixels() -> bytes:
         return bytes(canvas.screenshot_as_png)
 
-    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    wait_until(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
     return pixels
 
 
@@ -180,7 +171,7 @@ def test_a_good_verdict_is_no_more_than_it_rests_on(opened):
     assert unusual.text == "⚠ unusual 1"
     # A page that still moves would have a pointer miss it.
     opened.execute_script("arguments[0].click()", unusual)
-    wait(lambda: rows(opened) == ["cup"])
+    wait_until(lambda: rows(opened) == ["cup"])
     row = opened.find_element("css selector", "tbody tr:not(.space)")
     assert "⚠" in row.text and f"unusual masks: {HOSTILE}" in row.text
     row.click()
@@ -251,24 +242,24 @@ def test_it_opens_an_asset_that_turns(opened):
     front = pixels()
     assert opened.find_element("id", "scale").text.split() == ["jelly", "metal"]
     canvas.send_keys(Keys.ARROW_RIGHT * 4)
-    wait(lambda: pixels() != front)
+    wait_until(lambda: pixels() != front)
     still = pixels()
     click(opened, "[data-mode=youngs_modulus]")
-    wait(lambda: pixels() != still)
+    wait_until(lambda: pixels() != still)
     assert "Pa" in opened.find_element("id", "scale").text
     click(opened, "[data-switch=turning]")
     moving = pixels()
-    wait(lambda: pixels() != moving)
+    wait_until(lambda: pixels() != moving)
     click(opened, "[data-switch=turning]")
     for switch in ("field", "before", "before", "slat"):
         before = pixels()
         click(opened, f"[data-switch={switch}]")
-        wait(lambda before=before: pixels() != before)
+        wait_until(lambda before=before: pixels() != before)
     click(opened, "#next")
-    wait(lambda: title.text.startswith("bear.side"))
+    wait_until(lambda: title.text.startswith("bear.side"))
     assert opened.current_url.endswith("#asset=bear.side")
     canvas.send_keys(Keys.ESCAPE)
-    wait(lambda: not opened.execute_script("return document.getElementById('asset').open"))
+    wait_until(lambda: not opened.execute_script("return document.getElementById('asset').open"))
     assert_quiet(opened)
 
 
@@ -325,9 +316,9 @@ def test_a_deformed_asset_is_found_and_shown_through_its_map(browser, deformed_b
     click(browser, "[data-switch=slat]")
     after = pixels()
     click(browser, "[data-switch=before]")
-    wait(lambda: pixels() != after)
+    wait_until(lambda: pixels() != after)
     click(browser, "[data-switch=before]")
-    wait(lambda: pixels() == after)
+    wait_until(lambda: pixels() == after)
     assert_quiet(browser)
 
 
@@ -347,11 +338,11 @@ def test_tied_placements_are_stepped_through(browser, copy, tmp_path):
     click(browser, "[data-switch=slat]")
     taken = pixels()
     click(browser, "#ties button:nth-of-type(2)")
-    wait(lambda: pixels() != taken)
+    wait_until(lambda: pixels() != taken)
     click(browser, "#ties button:nth-of-type(1)")
-    wait(lambda: pixels() == taken)
+    wait_until(lambda: pixels() == taken)
     click(browser, "#next")
-    wait(lambda: browser.find_element("id", "asset-title").text.startswith("dog"))
+    wait_until(lambda: browser.find_element("id", "asset-title").text.startswith("dog"))
     assert not browser.find_element("id", "ties").is_displayed()
     assert_quiet(browser)
 
