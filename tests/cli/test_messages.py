@@ -13,7 +13,7 @@ from support.faults import no_room
 from support.made_store import rewrite
 from support.predictions import write_predictions
 from support.rights import BOUND_BY_PERMISSIONS
-from support.synthetic import Dataset
+from support.synthetic import Dataset, definition
 
 from slatprep import build_store, open_store
 from slatprep.cli.info import show_quality
@@ -32,10 +32,8 @@ def of_kinds(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build `mixed` with a table that has the category of the cup alone."""
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "kinds.json").write_text(json.dumps({"cup": {"obj_class": "vessels"}}))
-    (folder / "dataset.toml").write_text(
-        f'[pixieverse]\nroot = "{mixed.root}/pixieverse"\n[slat]\nroot = "{mixed.root}/slat"\n'
-        f'[pairing]\ncategories = "kinds.json"\n'
-    )
+    kinds = '[pairing]\ncategories = "kinds.json"\n'
+    (folder / "dataset.toml").write_text(definition(mixed.parameters()) + kinds)
     words = ("--config", folder / "dataset.toml", "--out", folder / "s.zarr")
     assert "unknown: the category of 4" in run("build-store", *words, code=1).stdout
     return folder / "s.zarr"
