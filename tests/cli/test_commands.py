@@ -11,14 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
-from support.commands import document, parse_command, refused, run
+from support.commands import document, parse_command, python, refused, run
 from support.trees import tree
 
+from slatprep import ConfigError, open_store
 from slatprep.cli.commands import COMMANDS
-from slatprep.errors import ConfigError
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import PRESETS, BuildParameters
-from slatprep.store import open_store
 
 THREE_ASSETS = ("--assets", "3", "--seed", "3", "--level", "0")
 
@@ -74,8 +73,7 @@ def test_a_command_imports_no_more_than_it_needs(demo):
     store = str(demo / "demo.zarr")
     unchanged = ["build-store", "--config", str(demo / "demo" / "dataset.toml"), "--out", store]
     lines = (["--help"], ["check-alignment", "--help"], ["info", store], ["list", store], unchanged)
-    command = [sys.executable, "-c", script, json.dumps(lines)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = python("-c", script, json.dumps(lines))
     for word, printed in zip(
         ("build-store", "The exit code is 1 unless", "good", "good", "3 taken over"),
         done.stdout.split("#" * 9)[:5], strict=True,
@@ -97,9 +95,7 @@ def test_a_backend_that_matplotlib_does_not_know_hinders_no_picture():
         "import sys\nfrom slatprep.cli import main\nsys.argv = ['slatprep', '--version']\n"
         "try: main()\nexcept SystemExit: import matplotlib\nprint(matplotlib.get_backend())"
     )
-    command, strange = [sys.executable, "-c", script], os.environ | {"MPLBACKEND": "none-such"}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=strange)
-    assert done.stdout.split()[-1].lower() == "agg"
+    assert python("-c", script, MPLBACKEND="none-such").stdout.split()[-1].lower() == "agg"
 
 
 def test_entry_holds_libraries_to_one_thread():
@@ -112,10 +108,7 @@ def test_entry_holds_libraries_to_one_thread():
         "print([pool['num_threads'] for pool in threadpoolctl.threadpool_info()])\n"
         "print(os.environ['NUMBA_NUM_THREADS'], os.environ['OMP_NUM_THREADS'])\n"
     )
-    environment = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
-    )
+    done = python("-c", script, OMP_NUM_THREADS="2", OPENBLAS_NUM_THREADS="2")
     *_, pools, variables = done.stdout.splitlines()
     assert set(json.loads(pools)) == {1}
     assert variables == "1 1"
@@ -268,8 +261,7 @@ def test_a_reader_that_has_read_enough_is_no_fault(mixed_build, tmp_path):
 
 def test_a_python_without_docstrings_is_told_that_the_commands_are_made_of_them():
     for words in (["--help"], ["info"]):
-        program = [sys.executable, "-OO", "-m", "slatprep", *words]
-        done = subprocess.run(program, capture_output=True, text=True, check=False)
-        assert done.returncode == 2 and done.stdout == ""
+        done = python("-OO", "-m", "slatprep", *words, code=2)
+        assert done.stdout == ""
         assert done.stderr.startswith("slatprep: error: ") and "-OO" in done.stderr
         assert done.stderr.count("\n") == 1

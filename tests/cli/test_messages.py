@@ -1,29 +1,25 @@
 """What commands say to somebody who meets them for the first time, and with which exit code."""
 
-import errno
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.commands import document, refused, run
+from support.commands import document, python, refused, run
+from support.faults import no_room
 from support.made_store import rewrite
 from support.predictions import write_predictions
 from support.rights import BOUND_BY_PERMISSIONS
-from support.synthetic import Dataset
+from support.synthetic import Dataset, definition
 
-from slatprep import open_store
+from slatprep import build_store, open_store
 from slatprep.cli.info import show_quality
 from slatprep.cli.output import Output
 from slatprep.inspect.overview import overview_of
 from slatprep.learn.runs import EpochRecord
-from slatprep.pipeline.dataset import build_store
 from slatprep.storage import atomic
 from slatprep.storage.place import place_of
 from slatprep.store.integrity import digests_in
@@ -36,10 +32,8 @@ def of_kinds(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build `mixed` with a table that has the category of the cup alone."""
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "kinds.json").write_text(json.dumps({"cup": {"obj_class": "vessels"}}))
-    (folder / "dataset.toml").write_text(
-        f'[pixieverse]\nroot = "{mixed.root}/pixieverse"\n[slat]\nroot = "{mixed.root}/slat"\n'
-        f'[pairing]\ncategories = "kinds.json"\n'
-    )
+    kinds = '[pairing]\ncategories = "kinds.json"\n'
+    (folder / "dataset.toml").write_text(definition(mixed.parameters()) + kinds)
     words = ("--config", folder / "dataset.toml", "--out", folder / "s.zarr")
     assert "unknown: the category of 4" in run("build-store", *words, code=1).stdout
     return folder / "s.zarr"
@@ -51,9 +45,7 @@ def of_kinds(mixed: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("subset", "STORE", "--asset", "NOBODY", "--out", "OUT"),
     ("transfer", "POINTS", "--store", "STORE", "--asset", "NOBODY", "--out", "OUT"),
 ])  # fmt: skip
-def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use_everywhere(
-    words, store, tmp_path
-):
+def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use(words, store, tmp_path):
     np.save(tmp_path / "p.npy", np.zeros((3, 3), np.float32))
     places = {"STORE": store, "OUT": tmp_path / "out", "POINTS": tmp_path / "p.npy"}
     for name, said in (
@@ -108,10 +100,21 @@ def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use_everywhere(
     ("make-demo d --level x", 2, "expected a whole number of at least 0 and at most 7"),
     ("simulate --height x", 2, "'x' is no number; expected a number of at least 0"),
     ("build-store --jobs 0", 2, "0 is not in the range x>=1"),
+    ("build-store --jobs 2 --scheduler tcp://h:1 --out NEW", 2, "--jobs is for this machine"),
+    ("check-alignment --worst 2 --store STORE --picture NEW.png", 2, "need a folder"),
+    ("stats STORE --picture NEW.gif", 2, "none of .png, .svg, .pdf"),
+    ("stats STORE --category boat", 2, "boat"),
+    ("subset STORE --verdict failed --out NEW", 2,
+     "no asset of STORE is chosen; expected one at least: there are 5 good"),
+    ("build-store --slat SLAT --out NEW --pixieverse ROOT/pixeverse", 2,
+     "did you mean ROOT/pixieverse?"),
+    ("build-store --slat SLAT --out NEW --pixieverse ROOT/absent", 2, "option --pixieverse: "),
+    ("build-store --slat SLAT --out NEW --pixieverse ROOT/absent", 2,
+     "ROOT does, and holds the folders "),
 ])  # fmt: skip
 def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tmp_path):
     places = {"STORE": store, "FOLDER": tmp_path, "NEW": tmp_path / "new"}
-    places |= {"SLAT": mixed.root / "slat", "GRIDS": mixed.root / "pixieverse"}
+    places |= {"SLAT": mixed.root / "slat", "GRIDS": mixed.root / "pixieverse", "ROOT": mixed.root}
     for word, place in places.items():
         words, said = words.replace(word, str(place)), said.replace(word, str(place))
     command, *rest = words.split()
@@ -140,27 +143,13 @@ def test_no_default_is_printed_of_an_option_that_is_empty_without_it():
     assert '""' not in run("publish", "--help").stdout
 
 
-def test_a_choice_that_leaves_nothing_says_what_there_is(store, tmp_path):
-    told = refused("subset", store, "--verdict", "failed", "--out", tmp_path / "s.zarr")
-    assert f"no asset of {store} is chosen; expected one at least: there are 5 good" in told
-
-
 def test_names_that_were_looked_for_are_told_once(make_dataset, tmp_path):
     dataset = make_dataset(*"abc")
     for name in "ab":
         (dataset.root / "slat" / f"{name}.npz").unlink()
-    words = "--pixieverse", dataset.root / "pixieverse", "--slat", dataset.root / "slat"
-    told = refused("build-store", *words, "--out", tmp_path / "s.zarr", code=1)
+    told = refused("build-store", *dataset.sides, "--out", tmp_path / "s.zarr", code=1)
     assert "a: " in told and "no SLAT for id 'b'" in told
     assert told.count("looked for") == 1
-
-
-def test_a_folder_that_is_not_there_is_told_with_those_that_are(make_dataset, tmp_path):
-    root = make_dataset("a").root
-    words = "build-store", "--slat", root / "slat", "--out", tmp_path / "s", "--pixieverse"
-    assert f"did you mean {root}/pixieverse?" in refused(*words, root / "pixeverse")
-    told = refused(*words, root / "absent")
-    assert "option --pixieverse: " in told and f"{root} does, and holds the folders " in told
 
 
 def test_a_category_with_the_name_of_another_row_is_in_quotes(store, copy, tmp_path):
@@ -220,8 +209,7 @@ def test_quiet_commands_that_make_something_print_nothing(store, tmp_path):
 
 
 def test_sources_of_a_joined_store_are_said_to_lie_apart(store, mixed, tmp_path):
-    other = Dataset(tmp_path / "other")
-    other.add("elk", seed=8)
+    other = Dataset(tmp_path / "other").having("elk", seed=8)
     pixieverse = other.root / "pixieverse"
     build_store(other.parameters(), tmp_path / "elk.zarr")
     both = tmp_path / "both.zarr"
@@ -250,16 +238,12 @@ def test_documents_begin_alike_and_say_which_store_as_it_was_typed(store, monkey
     assert told["info"]["files"] == told["verify"]["files"] == files
 
 
-def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(store, tmp_path):
-    own = tmp_path / "s.zarr"
-    shutil.copytree(store, own)
-    (own / "zarr.json").chmod(0)
+def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(copy):
+    (copy / "zarr.json").chmod(0)
     script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
-    command = [sys.executable, "-c", script, "info", str(own)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "zarr.json: may not be read (Permission denied)" in done.stderr
-    assert "is not a slatprep store" not in done.stderr
+    told = python("-c", script, "info", copy, code=1).stderr
+    assert "zarr.json: may not be read (Permission denied)" in told
+    assert "is not a slatprep store" not in told
 
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monkeypatch):
@@ -278,9 +262,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monke
     monkeypatch.setattr("slatprep.pipeline.dataset.build_store", built)
     monkeypatch.setattr("slatprep.learn.train.train", trained)
     monkeypatch.setattr("slatprep.demo.make_demo", made)
-    parts = mixed.parameters()
-    sources = ("--pixieverse", parts.pixieverse.root, "--slat", parts.slat.root)
-    stopped = refused("build-store", *sources, "--out", tmp_path / "new.zarr", code=130)
+    stopped = refused("build-store", *mixed.sides, "--out", tmp_path / "new.zarr", code=130)
     assert "2 of 3 assets are done and kept; the same command goes on from there" in stopped
     stopped = refused("train", store, "--out", tmp_path / "run", "--keep", "last", code=130)
     assert "epochs up to 4 are kept, and the steps since then but for the last 30 s" in stopped
@@ -295,10 +277,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monke
     "words", ["report --out", "describe --out", "check-alignment --asset ant --picture"]
 )
 def test_a_full_disk_is_a_line(store, tmp_path, monkeypatch, words):
-    def full(path: Path) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(atomic, "flush", full)
+    monkeypatch.setattr(atomic, "flush", no_room)
     line = refused(*words.split(), tmp_path / "result.png", store, code=1)
     assert "cannot be written to" in line
     assert "No space left on device" in line and "ake room" in line
@@ -315,28 +294,21 @@ def test_a_folder_that_takes_nothing_is_a_line(store):
 # -- where `verify` looks for records -------------------------------------------
 
 
-def test_records_that_make_left_are_found(mixed_build, deformed_build, tmp_path, monkeypatch):
-    """Unless they are those of another build."""
+def test_records_of_its_own_build_are_found(mixed_build, deformed_build, tmp_path, monkeypatch):
+    """Where make leaves them, too; those of another build are not taken."""
     monkeypatch.chdir(tmp_path)
     store = Path(shutil.copytree(str(mixed_build.store), "data/demo.zarr"))
-    shutil.copytree(mixed_build.records.parent, "manifests/build/demo")
-    assert "records: manifests/build/demo" in run("verify", store).output
-    assert "no records" not in run("report", store).output
-    shutil.rmtree("manifests")
     shutil.copytree(deformed_build.records.parent, "manifests/build/demo")
     assert "records: none beside the store" in run("verify", store).output
     assert "no records of data/demo.zarr found" in run("report", store).output
-
-
-def test_records_of_the_store_s_build_are_taken_and_other_ones_named(
-    mixed_build, deformed_build, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    store = Path(shutil.copytree(str(mixed_build.store), "data/demo.zarr"))
-    shutil.copytree(deformed_build.records.parent, "data/demo.manifests")
+    Path("manifests/build/demo").rename("data/demo.manifests")
     for command in ("verify", "report"):
         said = " ".join(run(command, store, code=1).output.split())
         assert "records with --manifests, or build again" in said
     shutil.copytree(mixed_build.records.parent, "manifests/build/demo")
-    assert "records: manifests/build/demo" in run("verify", store).output
-    assert "page:" in run("report", store).output
+    for others in (True, False):
+        if not others:
+            shutil.rmtree("data/demo.manifests")
+        assert "records: manifests/build/demo" in run("verify", store).output
+        printed = run("report", store).output
+        assert "page:" in printed and "no records" not in printed

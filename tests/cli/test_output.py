@@ -14,12 +14,11 @@ import pytest
 from click.testing import CliRunner
 from support.commands import document, run
 
-from slatprep import open_store
+from slatprep import PropertyRange, Verdict, open_store
 from slatprep.cli import output as module
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, command
 from slatprep.inspect.overview import list_assets
-from slatprep.records import PropertyRange, Verdict
 from slatprep.store.records import StoredRecords
 
 

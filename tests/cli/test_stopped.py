@@ -12,6 +12,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import pytest
+from support.commands import python
 from support.faults import inject
 from support.synthetic import Dataset
 from support.trees import tree
@@ -44,8 +45,7 @@ def _run(step: str, number: signal.Signals, line: list[str], said: Path, lost: b
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """One asset, and in a folder the store of another, with its records."""
-    old = Dataset(tmp_path_factory.mktemp("old"))
-    old.add("z", seed=3)
+    old = Dataset(tmp_path_factory.mktemp("old")).having("z", seed=3)
     made = Dataset(tmp_path_factory.mktemp("made")).having("a")
     build_store(old.parameters("pixie"), made.root / "stores" / "s.zarr")
     return made
@@ -63,10 +63,7 @@ def test_a_signal_at_a_step(step, number, lost, sources, tmp_path):
     out = folder / "s.zarr"
     before, there = tree(out), set(folder.iterdir())
     said = tmp_path / "said"
-    line = [
-        "build-store", "--pixieverse", str(sources.root / "pixieverse"),
-        "--slat", str(sources.root / "slat"), "--ranges", "pixie", "--out", str(out),
-    ]  # fmt: skip
+    line = [*map(str, ("build-store", *sources.sides, "--ranges", "pixie", "--out", out))]
     how = {"target": _run, "args": (step, number, line, said, lost)}
     forked = multiprocessing.get_context("fork").Process(**how)
     forked.start()
@@ -105,19 +102,15 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize(
-    ("call", "printed"),
-    [
-        ("interrupted()", ["stopped"]),
-        # Python drops what a destructor raises, and zarr's thread would go on writing.
-        ("Gone()", ["ended", "stopped"]),
-        ("library['call']()", ["ended", "stopped"]),
-    ],
-)
+@pytest.mark.parametrize(("call", "printed"), [
+    ("interrupted()", ["stopped"]),
+    # Python drops what a destructor raises, and zarr's thread would go on writing.
+    ("Gone()", ["ended", "stopped"]),
+    ("library['call']()", ["ended", "stopped"]),
+])  # fmt: skip
 def test_a_stop_waits_where_it_would_be_lost(call, printed):
-    line = [sys.executable, "-c", INTERRUPTED.replace("CALL", call)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
-    assert (done.stdout.split(), done.stderr, done.returncode) == (printed, "", 0)
+    done = python("-c", INTERRUPTED.replace("CALL", call))
+    assert (done.stdout.split(), done.stderr) == (printed, "")
 
 
 ENDING = """
@@ -136,9 +129,7 @@ main()
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_a_signal_while_python_ends_changes_nothing(name):
-    line = [sys.executable, "-c", ENDING.replace("SIGNAL", name)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=60)
-    assert (done.stderr, done.returncode) == ("ended\n", 0)
+    assert python("-c", ENDING.replace("SIGNAL", name)).stderr == "ended\n"
 
 
 STARTING = """

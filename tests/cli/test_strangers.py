@@ -1,14 +1,13 @@
 """Whatever a stranger's store, records or truth hold, no command ends in a traceback."""
 
 import csv
-from collections.abc import Callable
+import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click.testing import Result
 from support.commands import document, refused, run
-from support.made_store import edit_json, rewrite
+from support.made_store import GONE, placed, rewrite
 from support.predictions import write_predictions
 
 
@@ -33,47 +32,44 @@ def every_command(store: Path) -> dict[str, Result]:
     return {name: run(*line, code=None) for name, line in lines.items()}
 
 
-def _set(*path: str, value: object) -> Callable[[dict[str, Any]], object]:
-    def change(document: dict[str, Any]) -> None:
-        for key in path[:-1]:
-            document = document[key]
-        document[path[-1]] = value
-
-    return change
-
-
-SAMPLE = ("build", "parameters", "sample")
-ATTRIBUTES: dict[str, Callable[[dict[str, Any]], object]] = {
-    "no build": lambda a: a.pop("build"),
-    "build a list": _set("build", value=[1]),
-    "no parameters": _set("build", "parameters", value={}),
-    "no radius": _set("build", "parameters", "align", value={}),
-    "versions a number": _set("build", "versions", value=5),
-    "name a list": _set("build", "name", value=[1]),
-    "no ranges": lambda a: a.pop("normalization"),
-    "text for a bound": _set("normalization", "density", "lo", value="x"),
-    "endless bound": _set("normalization", "density", "hi", value=1e999),
-    "bounds exchanged": _set("normalization", "density", "lo", value=99),
-    "no columns": lambda a: a.pop("property_columns"),
-    "few columns": _set("property_columns", value=["density"]),
-    "columns a number": _set("property_columns", value=5),
-    "classes a number": _set("material_classes", value=[1] * 8),
-    "a lone surrogate": _set("build", "name", value="\ud800"),
-    "width 0": _set(*SAMPLE, "vote_width", value=0),
-    "width tiny": _set(*SAMPLE, "vote_width", value=1e-300),
-    "width huge": _set(*SAMPLE, "vote_width", value=1e300),
-    "width text": _set(*SAMPLE, "vote_width", value="x"),
-    "distance huge": _set(*SAMPLE, "max_distance", value=1e300),
-    "method other": _set(*SAMPLE, "method", value="other"),
-    "manifest a number": _set("manifest", value=5),
-    "resolution 1": _set("resolution", value=1),
-    "version true": _set("format_version", value=True),
+SAMPLE = "build/parameters/sample"
+ATTRIBUTES: dict[str, tuple[str, object]] = {
+    "no build": ("build", GONE),
+    "build a list": ("build", [1]),
+    "no parameters": ("build/parameters", {}),
+    "no radius": ("build/parameters/align", {}),
+    "versions a number": ("build/versions", 5),
+    "name a list": ("build/name", [1]),
+    "no ranges": ("normalization", GONE),
+    "text for a bound": ("normalization/density/lo", "x"),
+    "endless bound": ("normalization/density/hi", 1e999),
+    "bounds exchanged": ("normalization/density/lo", 99),
+    "no columns": ("property_columns", GONE),
+    "few columns": ("property_columns", ["density"]),
+    "columns a number": ("property_columns", 5),
+    "classes a number": ("material_classes", [1] * 8),
+    "a lone surrogate": ("build/name", "\ud800"),
+    "width 0": (f"{SAMPLE}/vote_width", 0),
+    "width tiny": (f"{SAMPLE}/vote_width", 1e-300),
+    "width huge": (f"{SAMPLE}/vote_width", 1e300),
+    "width text": (f"{SAMPLE}/vote_width", "x"),
+    "distance huge": (f"{SAMPLE}/max_distance", 1e300),
+    "method other": (f"{SAMPLE}/method", "other"),
+    "manifest a number": ("manifest", 5),
+    "resolution 1": ("resolution", 1),
+    "version true": ("format_version", True),
 }
+
+
+def put(file: Path, place: str, value: object) -> None:
+    """Replace a value of a JSON file."""
+    file.write_text(json.dumps(placed(json.loads(file.read_text()), place, value)))
 
 
 @pytest.mark.parametrize("case", ATTRIBUTES)
 def test_attributes(store, case):
-    edit_json(store / "zarr.json", lambda document: ATTRIBUTES[case](document["attributes"]))
+    place, value = ATTRIBUTES[case]
+    put(store / "zarr.json", f"attributes/{place}", value)
     for name, done in every_command(store).items():
         assert done.exit_code == 1, name
         assert "slatprep: error" in done.stderr or name == "verify"
@@ -82,25 +78,23 @@ def test_attributes(store, case):
 
 
 def test_attributes_that_are_not_known_hinder_nobody(store):
-    def change(document: dict[str, Any]) -> None:
-        attributes = document["attributes"]
-        attributes["mine"] = {"x": [1, None, "y"]}
-        attributes["build"]["parameters"]["sample"]["of_tomorrow"] = 5
-        attributes["build"]["parameters"]["align"]["engine"] = "of tomorrow"
-
-    edit_json(store / "zarr.json", change)
+    for place, value in (
+        ("mine", {"x": [1, None, "y"]}), (f"{SAMPLE}/of_tomorrow", 5),
+        ("build/parameters/align/engine", "of tomorrow"),
+    ):  # fmt: skip
+        put(store / "zarr.json", f"attributes/{place}", value)
     for name, done in every_command(store).items():
         assert done.exit_code == (name == "verify"), done.output
 
 
-RECORDS: dict[str, tuple[str, bytes | Path | Callable[[dict[str, Any]], object]]] = {
+RECORDS: dict[str, tuple[str, bytes | Path | tuple[str, object]]] = {
     "a list": ("build.json", b"[1]"),
     "nested": ("build.json", b"[" * 100_000),
     "nested object": ("build.json", b'{"a":' * 100_000),
     "text": ("build.json", b"\xff\xfe"),
-    "counts a list": ("build.json", _set("counts", value=[1])),
+    "counts a list": ("build.json", ("counts", [1])),
     "huge": ("build.json", b" " * (2**24 + 1)),
-    "endless": ("build.json", _set("duration_s", value=1e999)),
+    "endless": ("build.json", ("duration_s", 1e999)),
     "lines of lists": ("assets.jsonl", b"[1]\n5\nnull\n"),
     "nested line": ("assets.jsonl", b"[" * 100_000),
     "long line": ("assets.jsonl", b"x" * 2**23),
@@ -122,8 +116,8 @@ def test_records_beside_a_store(store, case):
     if isinstance(content, Path):
         file.unlink()
         file.symlink_to(content)
-    elif callable(content):
-        edit_json(file, content)
+    elif isinstance(content, tuple):
+        put(file, *content)
     else:
         file.write_bytes(content)
     for command in READERS[name]:
@@ -161,8 +155,7 @@ def test_a_table_of_scores_has_no_formulas(store, tmp_path):
     for row, category in enumerate(("=cmd|x", "+1", "-1", "@a\x1b[2J", " =b")):
         rewrite(store, "asset/category", row, category)
     table = tmp_path / "scores.csv"
-    words = ("--store", store, "--split", "all", "--csv", table)
-    run("evaluate", predictions, *words, code=None)
+    run("evaluate", predictions, "--store", store, "--split", "all", "--csv", table, code=None)
     with table.open(encoding="utf-8", newline="") as file:
         first = {row[0] for row in csv.reader(file)}
     # The bear's two views are one object, of the first one's category.

@@ -112,8 +112,7 @@ def test_other_sources_ranges_and_assets(tmp_path):
     found = compare_stores(tmp_path / "a.zarr", str(tmp_path / "b.zarr"))
     assert (found.only_a, found.only_b, found.assets) == (("gone",), ("new",), 2)
     settings = {one.name: (one.a, one.b) for one in found.settings}
-    span = b.normalization.ranges[1]
-    assert settings["normalization.density.lo"][1] == span.lo
+    assert settings["normalization.density.lo"][1] == b.normalization.ranges[1].lo
     assert settings["normalization.density.source"] == ("pixie", "dataset")
     of = {one.asset_id: one for one in found.worst}
     softer = of["softer"]
@@ -144,8 +143,7 @@ def test_the_command_tells_it_and_how_it_ended(mixed_build, copy):
     found = document(*words, code=1)
     assert found["what"] == {"columns": 4, "verdict": 1} and len(found["worst"]) == 5
     assert found["moved"] is None
-    few = document(*words, "--worst", 2, code=1)
-    assert few == found | {"worst": found["worst"][:2]}
+    assert document(*words, "--worst", 2, code=1) == found | {"worst": found["worst"][:2]}
 
 
 def test_trouble_is_neither_the_same_nor_different(mixed_build, copy):

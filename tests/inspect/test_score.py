@@ -9,7 +9,7 @@ from support.commands import document, refused, run
 from support.made_store import rewrite
 from support.shapes import GRID, annotated, field_of, latents_of
 
-from slatprep.errors import InputError
+from slatprep import InputError, open_store
 from slatprep.geometry.frames import make_transform, places_of
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.inspect.score import (
@@ -19,7 +19,6 @@ from slatprep.inspect.score import (
     score_against_truth,
     summarise,
 )
-from slatprep.store import open_store
 
 # A rod of two materials along x in the PixieVerse frame.
 ROD = np.array([[x, 32, 32] for x in range(20, 40)])

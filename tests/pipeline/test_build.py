@@ -86,16 +86,13 @@ def test_folders_instead_of_parameters_are_answered_with_what_to_give(tmp_path):
         build_store("grids", tmp_path / "s.zarr")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("group", "wrong", "said"),
-    [
-        ("align", {"engine": "zz"}, r"align\.engine: got 'zz'; expected 'field'"),
-        ("store", {"voxel_chunk": 0}, r"store\.voxel_chunk: got 0; expected greater than 0"),
-        ("sample", {"max_distance": np.nan}, r"sample\.max_distance: got nan"),
-        ("pixieverse", {"samples": "some"}, r"pixieverse\.samples: got 'some'"),
-        ("slat", {"root": None}, r"slat\.root: got None"),
-    ],
-)
+@pytest.mark.parametrize(("group", "wrong", "said"), [
+    ("align", {"engine": "zz"}, r"align\.engine: got 'zz'; expected 'field'"),
+    ("store", {"voxel_chunk": 0}, r"store\.voxel_chunk: got 0; expected greater than 0"),
+    ("sample", {"max_distance": np.nan}, r"sample\.max_distance: got nan"),
+    ("pixieverse", {"samples": "some"}, r"pixieverse\.samples: got 'some'"),
+    ("slat", {"root": None}, r"slat\.root: got None"),
+])  # fmt: skip
 def test_senseless_parameters_are_refused_at_each_door(make_dataset, tmp_path, group, wrong, said):
     parameters = make_dataset().parameters(**{group: wrong})
     for door in (build_store, plan_build, align_pairs):
@@ -248,13 +245,3 @@ def test_alignment_alone_counts_assets_and_gives_the_transforms(mixed, mixed_bui
         assert record.get("alignment") == built[asset_id].get("alignment")
         assert record.get("normalization") is None
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mixed.jsonl"]
-
-
-def test_no_store_is_built_inside_another(built):
-    """The next build of the outer one would remove it as a stray."""
-    dataset, outer = built
-    before = tree(outer)
-    for inner in (outer / "inner.zarr", outer / "asset" / "deep" / "inner.zarr"):
-        with pytest.raises(ConfigError, match=r"lies inside the store .*s\.zarr"):
-            build_store(dataset.parameters(), inner)
-    assert tree(outer) == before

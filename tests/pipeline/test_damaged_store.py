@@ -75,9 +75,7 @@ def test_rows_that_are_gone_are_written_again(built):
 
 @pytest.mark.filterwarnings("ignore:Consolidated metadata")
 @pytest.mark.parametrize("what", ["transform", "class"])
-def test_a_transform_or_a_class_that_sources_do_not_give_is_found_anew(
-    built, undisturbed, aligned, what
-):
+def test_a_transform_or_class_of_no_source_is_found_anew(built, undisturbed, aligned, what):
     """Every checksum and digest is right, and yet the record is not of these rows."""
     _, out = built
 

@@ -11,18 +11,12 @@ import pytest
 from support.commands import document, run
 from support.trees import copied, tree
 
-from slatprep.errors import StoreError
+from slatprep import Store, StoreError, open_store
 from slatprep.inspect.pictures.statistics import draw_errors
 from slatprep.pipeline import decoys
 from slatprep.pipeline.dataset import BuildSummary, build_store
-from slatprep.pipeline.decoys import (
-    allowed_decoys,
-    draw_decoys,
-    measure_errors,
-    unrelated_objects,
-)
+from slatprep.pipeline.decoys import allowed_decoys, draw_decoys, measure_errors, unrelated_objects
 from slatprep.pipeline.measured import measured_errors, told_of
-from slatprep.store import Store, open_store
 from slatprep.store.records import ERRORS, manifests_of
 
 
@@ -33,10 +27,14 @@ def store(mixed_build: BuildSummary, tmp_path_factory: pytest.TempPathFactory) -
     return open_store(copied(Path(str(mixed_build.store)), path))
 
 
+def objects_of(store: Store) -> dict[str, str]:
+    return dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+
+
 def test_decoys_are_of_other_objects_and_are_aligned_once(store):
     aligned: list[tuple[int, ...]] = []
     first = measure_errors(store, decoys=3, seed=1, progress=lambda *at: aligned.append(at))
-    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    objects = objects_of(store)
     assert len(first.decoys) == 3
     assert aligned == [(1, 3), (2, 3), (3, 3)]
     assert all(objects[one.grid] != objects[one.slat] for one in first.decoys)
@@ -51,11 +49,10 @@ def test_decoys_are_drawn_by_ids_and_seed_with_the_slat_of_the_nearest_size(stor
     keys, own = dict.fromkeys(store.ids, ""), unrelated_objects(store, [""] * len(store))
     few, more, drawn = (draw_decoys(store, keys, own, count, 1) for count in (2, 4, 100))
     assert drawn[:4] == more and more[:2] == few
-    assert [one.grid for one in draw_decoys(store, keys, own, 100, 2)] != [
-        one.grid for one in drawn
-    ]
+    of_another_seed = draw_decoys(store, keys, own, 100, 2)
+    assert [one.grid for one in of_another_seed] != [one.grid for one in drawn]
     sizes = dict(zip(store.ids, np.diff(store.offsets).tolist(), strict=True))
-    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    objects = objects_of(store)
     for one in drawn:
         others = [other for other in store.ids if objects[other] != objects[one.grid]]
         nearest = min(abs(sizes[other] - sizes[one.grid]) for other in others)
@@ -81,14 +78,12 @@ def test_pairs_that_share_a_slat_or_a_grid_are_no_decoys(make_dataset, tmp_path)
     assert "decoys need two objects that share neither grid nor SLAT" in said
 
 
-def test_each_object_has_a_decoy_before_any_has_two_and_meets_no_other_twice(
-    make_dataset, tmp_path
-):
+def test_each_object_has_a_decoy_before_any_has_two(make_dataset, tmp_path):
     dataset, out = make_dataset("a", "b", "c"), tmp_path / "s.zarr"
     dataset.add("d", 3, views=("front", "side", "top", "back", "left"))
     build_store(dataset.parameters(), out)
     store = open_store(out)
-    objects = dict(zip(store.ids, map(str, store.column("object_id")), strict=True))
+    objects = objects_of(store)
     own = unrelated_objects(store, decoys._evidence_of(store)[1])
     for seed in range(6):
         drawn = draw_decoys(store, dict.fromkeys(store.ids, ""), own, 99, seed)
@@ -230,9 +225,7 @@ def test_a_decoy_not_aligned_costs_no_build(make_dataset, tmp_path, monkeypatch,
 
 
 @pytest.mark.usefixtures("few_suffice")
-def test_a_fault_of_slatprep_s_own_is_raised_though_the_store_is_there(
-    make_dataset, tmp_path, monkeypatch
-):
+def test_a_fault_of_our_own_is_raised_though_there_is_a_store(make_dataset, tmp_path, monkeypatch):
     def faulty(*task: object) -> None:
         raise TypeError("not callable")
 

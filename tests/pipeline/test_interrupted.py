@@ -177,13 +177,10 @@ def test_a_source_that_vanishes_midway(reference, tmp_path, monkeypatch):
     ends_well(dataset, out, expected)
 
 
-@pytest.mark.parametrize(
-    ("mode", "told"),
-    [
-        (0o555, "locked (Permission denied); nothing was replaced"),
-        (0o000, "s.zarr: cannot be looked at (Permission denied)"),
-    ],
-)
+@pytest.mark.parametrize(("mode", "told"), [
+    (0o555, "locked (Permission denied); nothing was replaced"),
+    (0o000, "s.zarr: cannot be looked at (Permission denied)"),
+])  # fmt: skip
 def test_a_target_that_permissions_keep(reference, tmp_path, mode, told):
     dataset, _, expected = reference
     folder = tmp_path / "locked"

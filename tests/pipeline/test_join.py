@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.made_store import edit_attributes, rewrite
-from support.synthetic import Dataset
+from support.synthetic import Dataset, make_asset
 from support.trees import copied, records_of, tree
 
 from slatprep import ConfigError, StoreError, build_store, concat_stores, open_store, subset_store
@@ -99,16 +99,20 @@ def test_joined_stores_are_the_build_of_all_their_assets(folder, tmp_path):
     assert verify_store(tmp_path / "all.zarr").ok
 
 
-def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path):
-    whole = make_dataset("a", "b")
-    for number, object_id in enumerate("ab"):
-        part = Dataset(tmp_path / object_id).having(object_id, seed=number)
-        grid = part.assets[object_id].grid
-        grid[..., 1] *= 1.0 + number  # Else all assets have the same ranges.
+def build_parts_and_whole(folder: Path, *grids: np.ndarray) -> None:
+    """Build a store of each of two assets with these grids, and one of both."""
+    whole = Dataset(folder / "both").having(*"ab")
+    for number, (name, grid) in enumerate(zip("ab", grids, strict=True)):
+        part = Dataset(folder / name).having(name, seed=number)
         for dataset in (part, whole):
-            dataset.write_grid(object_id, grid)
-        build_store(part.parameters(), tmp_path / f"{object_id}.zarr")
-    build_store(whole.parameters(), tmp_path / "whole.zarr")
+            dataset.write_grid(name, grid)
+        build_store(part.parameters(), folder / f"{name}.zarr")
+    build_store(whole.parameters(), folder / "whole.zarr")
+
+
+def test_stores_with_ranges_of_their_own_get_those_of_all(tmp_path):
+    # Else all assets have the same ranges.
+    build_parts_and_whole(tmp_path, make_asset(0).grid, make_asset(1).grid * [1, 2, 1, 1])
     ours = [open_store(tmp_path / f"{name}.zarr").normalization for name in "ab"]
     assert ours[0] != ours[1]
 
@@ -126,24 +130,17 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(make_dataset, tmp_path
     for name in ("clipped", "clipped_grid"):
         lost = copied(tmp_path / "b.zarr", tmp_path / f"{name}.zarr")
         rewrite(lost, f"asset/{name}", 0, (0, 1, 0))
-        with pytest.raises(
-            StoreError, match="values of b were clipped to its ranges, so it cannot"
-        ):
+        told = "values of b were clipped to its ranges, so it cannot"
+        with pytest.raises(StoreError, match=told):
             concat_stores([tmp_path / "a.zarr", lost], tmp_path / "all.zarr")
 
 
-def test_one_value_of_a_store_is_a_point_in_the_ranges_of_all(make_dataset, tmp_path):
-    whole = make_dataset("a", "b")
-    for number, object_id in enumerate("ab"):
-        part = Dataset(tmp_path / object_id).having(object_id, seed=number)
-        grid = part.assets[object_id].grid
+def test_one_value_of_a_store_is_a_point_in_the_ranges_of_all(tmp_path):
+    grids = make_asset(0).grid, make_asset(1).grid
+    for grid, most in zip(grids, (0.3, 0.34), strict=True):
         occupied = grid[..., 3] != 7
-        ratios = np.linspace(0.3, 0.34, occupied.sum()) if number else 0.3
-        grid[occupied, 2] = ratios
-        for dataset in (part, whole):
-            dataset.write_grid(object_id, grid)
-        build_store(part.parameters(), tmp_path / f"{object_id}.zarr")
-    build_store(whole.parameters(), tmp_path / "whole.zarr")
+        grid[occupied, 2] = np.linspace(0.3, most, occupied.sum())
+    build_parts_and_whole(tmp_path, *grids)
     assert open_store(tmp_path / "a.zarr").normalization.ranges[2].hi == pytest.approx(0.8)
     concat_stores([tmp_path / "a.zarr", tmp_path / "b.zarr"], tmp_path / "all.zarr")
     joined, built = open_store(tmp_path / "all.zarr"), open_store(tmp_path / "whole.zarr")

@@ -1,6 +1,5 @@
 """Kernels are compiled once, before any worker starts, and the user is told."""
 
-import errno
 import os
 import signal
 import subprocess
@@ -12,7 +11,8 @@ import numpy as np
 import pytest
 from joblib.externals.loky import cpu_count
 from numba.core.caching import IndexDataCacheFile
-from support.faults import wait_until
+from support.commands import python
+from support.faults import no_room, wait_until
 from support.synthetic import Dataset
 
 from slatprep.geometry import kernel
@@ -72,16 +72,11 @@ def test_a_build_compiles_nothing_that_was_not_compiled_before_it(tmp_path):
     few.write_grid("a", grid)
     latents = np.random.default_rng(0).normal(0, 2, (2, 8)).astype(np.float32)
     few.write_slat("a.npz", np.argwhere(grid[..., 3] == 0).astype(np.uint8), latents)
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    python("-c", SCRIPT, tmp_path)
 
 
 def test_on_a_full_disk_kernels_are_compiled_in_memory(monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(IndexDataCacheFile, "save", full)
+    monkeypatch.setattr(IndexDataCacheFile, "save", no_room)
     monkeypatch.setattr(kernel, "KEPT", True)
     twice = kernel.kernel()(lambda value: 2 * value)
     assert twice(21) == 42
@@ -128,11 +123,7 @@ def _runs(process: int) -> bool:
 
 
 def test_where_no_folder_can_be_written_to_kernels_are_compiled_anew():
-    done = subprocess.run(
-        [sys.executable, "-c", UNKEPT],
-        capture_output=True, text=True, check=False, env=os.environ | NOWHERE,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    python("-c", UNKEPT, **NOWHERE)
 
 
 def test_jobs_are_no_more_than_there_is_work_for():

@@ -76,20 +76,17 @@ def digit(after: bytes) -> Callable[[bytes], bytes]:
     return changed
 
 
-@pytest.mark.parametrize(
-    ("file", "change"),
-    [
-        ("build.json", lambda text: b"[" * 100_000),
-        ("build.json", lambda text: b"[1]"),
-        ("build.json", lambda text: b'{"counts": [1]}'),
-        ("build.json", lambda text: b'{"id": "of another build"}'),
-        ("build.json", digit(b'"voxels": ')),
-        ("assets.jsonl", lambda text: text[:-500]),
-        ("assets.jsonl", lambda text: text + b"{}\n"),
-        ("assets.jsonl", digit(b'"slat_voxels":')),
-        ("assets.jsonl", None),
-    ],
-)
+@pytest.mark.parametrize(("file", "change"), [
+    ("build.json", lambda text: b"[" * 100_000),
+    ("build.json", lambda text: b"[1]"),
+    ("build.json", lambda text: b'{"counts": [1]}'),
+    ("build.json", lambda text: b'{"id": "of another build"}'),
+    ("build.json", digit(b'"voxels": ')),
+    ("assets.jsonl", lambda text: text[:-500]),
+    ("assets.jsonl", lambda text: text + b"{}\n"),
+    ("assets.jsonl", digit(b'"slat_voxels":')),
+    ("assets.jsonl", None),
+])  # fmt: skip
 def test_records_that_are_not_those_of_the_store_are_found_and_written_again(built, file, change):
     dataset, lines = built
     out, path = lines.parent.with_name("s.zarr"), lines.with_name(file)

@@ -75,11 +75,9 @@ def still_channel(dataset: Dataset, name: str) -> None:
 def test_objects_with_one_slat_or_one_grid_are_named(dataset, tmp_path):
     asset = dataset.assets["a"]
     dataset.write_slat("c.npz", asset.coords, asset.feats)
-    warnings = build_store(dataset.parameters(), tmp_path / "s.zarr").warnings
-    assert any(
-        "2 assets of different objects share the same SLAT (a = c)" in text for text in warnings
-    )
-    assert any("share the same grid (a = e" in text for text in warnings)
+    told = build_store(dataset.parameters(), tmp_path / "s.zarr").warnings
+    assert any("2 assets of different objects share the same SLAT (a = c)" in one for one in told)
+    assert any("share the same grid (a = e" in one for one in told)
 
 
 def test_a_scale_beyond_the_bounds_is_told(make_dataset, tmp_path):

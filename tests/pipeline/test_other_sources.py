@@ -357,12 +357,8 @@ def test_as_many_as_a_byte_holds_are_looked_up_and_counted(tmp_path):
 
 def test_nine_classes_and_other_properties_go_all_the_way_to_scores(tmp_path):
     write(tmp_path, "abcdefgh", classes=class_names(9), properties=HARD, slabs=9)
-    store = built(
-        tmp_path,
-        sample=SampleParameters(),
-        consensus=ConsensusParameters(settle=True),
-        witness=WitnessParameters(settle=True),
-    )
+    consensus, witness = ConsensusParameters(settle=True), WitnessParameters(settle=True)
+    store = built(tmp_path, sample=SampleParameters(), consensus=consensus, witness=witness)
     out, trained = store.path, tmp_path / "run"
     assert store.contents.background == 254
     assert not verify_store(out).findings

@@ -126,16 +126,14 @@ def test_building_without_it_brings_the_first_placements_back(habitual, agreed, 
 
 
 def test_a_subset_that_is_built_again_is_settled_by_its_own_assets(habitual, agreed, tmp_path):
-    alone, together = map(records_beside, agreed)
+    root, (alone, together) = habitual[0], map(records_beside, agreed)
     moved = next(name for name, record in together.items() if record["first_pass"])
-    shutil.copytree(habitual[0] / "pixieverse" / moved, tmp_path / "pixieverse" / moved)
+    shutil.copytree(root / "pixieverse" / moved, tmp_path / "pixieverse" / moved)
     (tmp_path / "slat").mkdir()
-    shutil.copy(habitual[0] / "slat" / f"{moved}.npz", tmp_path / "slat")
+    shutil.copy(root / "slat" / f"{moved}.npz", tmp_path / "slat")
     own = {"pixieverse": {"root": tmp_path / "pixieverse"}, "slat": {"root": tmp_path / "slat"}}
     given = {"normalize": {"ranges": "pixie"}, "consensus": {"settle": True}}
-    of_all, of_own = (
-        load_parameters(habitual[0] / "dataset.toml", g) for g in (given, given | own)
-    )
+    of_all, of_own = (load_parameters(root / "dataset.toml", g) for g in (given, given | own))
     whole, out = copied(agreed[1], tmp_path / "whole.zarr"), tmp_path / "out.zarr"
     build_store(of_all, whole)
     subset_store(whole, out, [moved])
@@ -203,12 +201,10 @@ def test_ties_that_change_labels_are_settled_right_and_recorded(telling, stores)
             assert alone[asset_id]["judgement"]["verdict"] == "doubtful"
         check = check_alignment(stores[1], asset_id)
         (figure,) = [one for one in check.figures if one.name == "ambiguity"]
-        probability = entry["settled_by"]["probability"]
-        assert check.settled_by == {"latents": probability}
+        right = entry["settled_by"]["probability"]
+        assert check.settled_by == {"latents": right}
         assert (figure.threshold_text, figure.passes) == ("settled", None)
-        told = (
-            f"settled by latents, right with a probability of {probability:.1%}: other placements"
-        )
+        told = f"settled by latents, right with a probability of {right:.1%}: other placements"
         assert told in check.words[-1] and not check.reasons
     assert any(before[asset_id] < 0.9 for asset_id in settled)
     moved = sum(heard[k]["alignment"]["transform"] != alone[k]["alignment"]["transform"]

@@ -2,7 +2,6 @@
 
 import gzip
 import hashlib
-import io
 import re
 import shutil
 import tarfile
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.memory import less_than
-from support.published import BLOCK, IDS, add, pack, parameters, write_object
+from support.published import BLOCK, IDS, add, add_link, pack, parameters, write_object, writing
 from support.synthetic import make_asset
 from support.trees import records_of, tree
 
@@ -135,14 +134,12 @@ def grid_of(objects: Path, number: int) -> Path:
 
 def test_last_of_two_members_counts_and_links_stay_in_the_archive(objects, made, strange, tmp_path):
     name = f"{IDS[0]}/sample_0/material_grid.npy"
-    with tarfile.open(strange / "tree.tar", "w") as archive:
+    with writing(strange / "tree.tar") as archive:
         archive.add(grid_of(objects, 1), arcname=f"./{name}")
         archive.add(grid_of(objects, 0), arcname=name)
         kinds = (tarfile.LNKTYPE, name), (tarfile.SYMTYPE, f"../../{name}"), (tarfile.CHRTYPE, "")
         for one, (kind, target) in zip(IDS[1:4], kinds, strict=True):
-            member = tarfile.TarInfo(f"{one}/sample_0/material_grid.npy")
-            member.type, member.linkname = kind, target
-            archive.addfile(member)
+            add_link(archive, f"{one}/sample_0/material_grid.npy", target, kind)
         for other in ("/etc/passwd", f"../{IDS[4]}/sample_0/material_grid.npy"):
             archive.addfile(tarfile.TarInfo(other))
     told: list[str] = []
@@ -170,11 +167,9 @@ def test_object_in_two_archives_is_not_taken_from_either(objects, made, strange,
 def test_a_link_holds_what_its_name_held_before_it(strange, suffix):
     """As GNU tar unpacks them; Python's tarfile writes through the link."""
     path = strange / f"tree{suffix}"
-    with tarfile.open(path, "w:gz" if suffix == ".tar.gz" else "w") as archive:
+    with writing(path) as archive:
         add(archive, "a/grid.npy", b"first")
-        link = tarfile.TarInfo("b/grid.npy")
-        link.type, link.linkname = tarfile.LNKTYPE, "a/grid.npy"
-        archive.addfile(link)
+        add_link(archive, "b/grid.npy", "a/grid.npy")
         add(archive, "a/grid.npy", b"later")
     made = Archive.on_disk(path, ("*/grid.npy",))
     held = {name: made.read(entry) for name, entry in made.index().members.items()}
@@ -188,7 +183,7 @@ def test_builds_that_want_other_members_of_an_archive_leave_each_other_theirs(st
         return {name: Archive.on_disk(path, (f"*/{name}",)) for name in ("grid.npy", "mask.npy")}
 
     for content in (b"first", b"later"):
-        with tarfile.open(path, "w:gz") as archive:
+        with writing(path) as archive:
             for name in ("a/grid.npy", "a/mask.npy"):
                 add(archive, name, content)
         one, other = of_all().values()
@@ -251,21 +246,21 @@ COMMENT = header(30, tarfile.XHDTYPE) + b"30 comment=aaaaaaaaaaaaaaaaaa\n".ljust
     (PAX_SIZE + header(0), "a header that claims -99 bytes|no intact"),
     (3000 * COMMENT + header(0), "recursion"),
     (header(2**30, tarfile.XHDTYPE) + bytes(2**24), "a header claims 1,073,741,824 bytes"),
+    (header(2**40, tarfile.GNUTYPE_LONGNAME), "a header claims 1,099,511,627,776 bytes"),
     (b"x" * BLOCK, "is damaged at byte|invalid header"),
     (b"", "has no end"),
-], ids=["negative", "huge", "negative by pax", "nested", "large", "no header", "cut"])  # fmt: skip
-def test_strange_headers_end_one_archive_alone(
-    objects, made, strange, tmp_path, suffix, behind, said
-):
-    whole, file = strange / "a.tar", strange / f"b{suffix}"
-    for number, path in enumerate((whole, strange / "b")):
-        pack(path, [objects / IDS[number]])
-    plain = strange.joinpath("b").read_bytes()
-    (strange / "b").unlink()
-    with tarfile.open(fileobj=io.BytesIO(plain)) as archive:
+], ids=[
+    "negative", "huge", "negative by pax", "nested", "large", "long name", "no header", "cut",
+])  # fmt: skip
+def test_strange_headers_end_one_archive(objects, made, strange, tmp_path, suffix, behind, said):
+    pack(strange / "a.tar", [objects / IDS[0]])
+    pack(tmp_path / "b", [objects / IDS[1]])
+    with tarfile.open(tmp_path / "b") as archive:
         archive.getmembers()
-        plain = plain[: archive.offset] + behind + bytes(10 * BLOCK) * bool(behind)
-    file.write_bytes(gzip.compress(plain) if suffix == ".tar.gz" else plain)
+        sound = (tmp_path / "b").read_bytes()[: archive.offset]
+    plain = sound + behind + bytes(10 * BLOCK) * bool(behind)
+    packed = gzip.compress(plain) if suffix == ".tar.gz" else plain
+    (strange / f"b{suffix}").write_bytes(packed)
     with less_than(300e6):
         summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
     (line,) = [text for about, text in summary.problems if about.startswith("b.tar")]
@@ -273,9 +268,7 @@ def test_strange_headers_end_one_archive_alone(
     assert open_store(tmp_path / "s.zarr").ids == [IDS[0], IDS[1]]
 
 
-def test_nothing_is_taken_from_a_gzip_archive_whose_checksum_is_wrong(
-    objects, made, strange, tmp_path
-):
+def test_a_gzip_archive_of_a_wrong_checksum_gives_nothing(objects, made, strange, tmp_path):
     pack(strange / "a.tar", [objects / IDS[0]])
     path = strange / "b.tar.gz"
     pack(path, [objects / IDS[1]])
@@ -292,7 +285,7 @@ def test_no_flipped_bit_of_a_gzip_archive_changes_a_file(strange):
         f"o{k}/sample_0/material_grid.npy": rng.integers(0, 9, 20_000, np.uint8) for k in range(4)
     }
     path = strange / "tree.tar.gz"
-    with tarfile.open(path, "w:gz") as archive:
+    with writing(path) as archive:
         for name, values in wanted.items():
             add(archive, name, values.tobytes())
     whole, told = path.read_bytes(), 0
@@ -310,7 +303,7 @@ def test_no_flipped_bit_of_a_gzip_archive_changes_a_file(strange):
 
 def test_junk_behind_a_gzip_archive_is_left_alone(strange):
     path = strange / "tree.tar.gz"
-    with tarfile.open(path, "w:gz") as archive:
+    with writing(path) as archive:
         add(archive, "o/sample_0/material_grid.npy", b"grid")
     path.write_bytes(path.read_bytes() + b"junk")
     index = Archive.on_disk(path, GRIDS).index()
@@ -334,7 +327,7 @@ def test_an_archive_that_is_none_is_named_where_it_lies(objects, made, strange, 
 
 def test_a_damaged_archive_is_named_whatever_the_pattern(objects, made, strange, tmp_path):
     path = strange / "tree.tar"
-    with tarfile.open(path, "w") as archive:
+    with writing(path) as archive:
         for number in range(2):
             archive.add(objects / IDS[number], arcname=f"below/{IDS[number]}")
     path.write_bytes(truncated(path.read_bytes()))
@@ -362,13 +355,9 @@ def test_what_lies_beside_archives_and_is_not_read_is_told(objects, made, strang
 
 @pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
 def test_a_link_to_a_file_that_no_pattern_names(objects, made, strange, tmp_path, suffix):
-    path = strange / f"tree{suffix}"
-    grid = grid_of(objects, 0)
-    with tarfile.open(path, "w:gz" if suffix == ".tar.gz" else "w") as archive:
-        add(archive, f"{IDS[0]}/other.npy", grid.read_bytes())
-        link = tarfile.TarInfo(f"{IDS[0]}/sample_0/material_grid.npy")
-        link.type, link.linkname = tarfile.LNKTYPE, f"{IDS[0]}/other.npy"
-        archive.addfile(link)
+    with writing(strange / f"tree{suffix}") as archive:
+        add(archive, f"{IDS[0]}/other.npy", grid_of(objects, 0).read_bytes())
+        add_link(archive, f"{IDS[0]}/sample_0/material_grid.npy", f"{IDS[0]}/other.npy")
     (pair,) = [one for one in discover(parameters(made, strange)) if one.grid]
     if suffix == ".tar":
         assert len(read_field(pair).voxels)
@@ -392,15 +381,6 @@ def test_archive_replaced_during_a_build_is_noticed(objects, strange):
     pack(path, [objects / IDS[1]])
     with pytest.raises(InputError, match="was replaced after it was looked at"):
         archive.read(entry)
-
-
-def test_header_that_claims_much_is_not_believed(strange):
-    path = strange / "tree.tar"
-    header = tarfile.TarInfo("long")
-    header.type, header.size = tarfile.GNUTYPE_LONGNAME, 2**40
-    path.write_bytes(header.tobuf(tarfile.GNU_FORMAT) + bytes(4096))
-    index = Archive.on_disk(path, ("*",)).index()
-    assert "is no intact tar archive (a header claims" in index.fault
 
 
 def test_long_names_are_read_in_both_forms(strange):

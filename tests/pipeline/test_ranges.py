@@ -1,7 +1,6 @@
 """Ranges by percentiles and of the objects to train on, against numpy over the raw grids."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +8,8 @@ import pytest
 from support.synthetic import Dataset
 from support.trees import tree
 
-from slatprep import ConfigError, InputError, build_store, open_store
+from slatprep import PROPERTY_COLUMNS, ConfigError, InputError, build_store, open_store
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import BuildParameters, NormalizeParameters
-from slatprep.records import PROPERTY_COLUMNS
 from slatprep.store.record import BuildRecord
 from slatprep.store.record_json import read_record
 
@@ -44,17 +41,13 @@ def ranges_of(out: Path) -> np.ndarray:
     return np.array([[one.lo, one.hi] for one in open_store(out).normalization.ranges])
 
 
-def of(dataset: Dataset, **normalize: object) -> BuildParameters:
-    return replace(dataset.parameters(), normalize=NormalizeParameters(**normalize))  # type: ignore[arg-type, no-any-return]
-
-
 def test_percentiles_are_numpy_s_whatever_the_jobs_and_what_was_there(make_dataset, tmp_path):
     dataset, out = noisy(make_dataset(*"abc")), tmp_path / "s.zarr"
     for lo, hi in ((0, 100), (0.5, 97.25), (1, 99)):
-        build_store(of(dataset, ranges=f"p{lo}-p{hi}"), out)
+        build_store(dataset.parameters(f"p{lo}-p{hi}"), out)
         np.testing.assert_allclose(ranges_of(out), expected(dataset, "abc", lo, hi), rtol=1e-12)
         assert open_store(out).normalization.source == f"p{lo}-p{hi}"
-    build_store(of(dataset, ranges="p1-p99"), tmp_path / "two.zarr", jobs=2)
+    build_store(dataset.parameters("p1-p99"), tmp_path / "two.zarr", jobs=2)
     assert tree(out) == tree(tmp_path / "two.zarr")
 
 
@@ -64,7 +57,7 @@ def test_an_object_of_several_views_counts_once(make_dataset, tmp_path):
     for view in ("front", "side"):
         dataset.write_slat(f"b/{view}.npz", shape.coords, shape.feats)
     (dataset.root / "slat" / "b.npz").unlink()
-    build_store(of(dataset, ranges="p1-p99"), out)
+    build_store(dataset.parameters("p1-p99"), out)
     assert open_store(out).ids == ["a", "b.front", "b.side"]
     np.testing.assert_allclose(ranges_of(out), expected(dataset, "ab", 1, 99), rtol=1e-12)
 
@@ -74,7 +67,7 @@ def test_ranges_of_the_objects_to_train_on(make_dataset, tmp_path, ranges, bound
     dataset, out = noisy(make_dataset(*"abc")), tmp_path / "s.zarr"
     lists = tmp_path / "lists.json"
     lists.write_text(json.dumps({"train": ["a", "b"], "test": ["c"]}))
-    chosen = of(dataset, ranges=ranges, objects="train", split_by=str(lists))
+    chosen = dataset.parameters(ranges, normalize={"objects": "train", "split_by": str(lists)})
     summary = build_store(chosen, out)
     np.testing.assert_allclose(ranges_of(out), expected(dataset, "ab", *bounds), rtol=1e-12)
     source = open_store(out).normalization.source
@@ -106,7 +99,7 @@ def test_files_that_moved_leave_the_store_as_it_is(make_dataset, tmp_path):
             file.parent.mkdir(exist_ok=True)
             file.write_text(text)
             said = {key: value.format(file) for key, value in chosen.items()}
-            summary = build_store(of(dataset, **said), out)
+            summary = build_store(dataset.parameters(normalize=said), out)
             builds.append((summary.build_id, out.stat().st_ino))
             assert verify_store(out).ok
         assert builds[0] == builds[1]
@@ -121,7 +114,7 @@ def test_by_hash_the_training_s_own_objects_count(make_dataset, tmp_path):
     names = "abcdef"
     dataset, out = noisy(make_dataset(*names)), tmp_path / "s.zarr"
     shares = (0.5, 0.25, 0.25)
-    build_store(of(dataset, ranges="p1-p99", objects="train", shares=shares), out)
+    build_store(dataset.parameters("p1-p99", normalize={"objects": "train", "shares": shares}), out)
     trained = "".join(assign_store(open_store(out), "hash", Shares(*shares)).lists()["train"])
     assert 0 < len(trained) < len(names)
     np.testing.assert_allclose(ranges_of(out), expected(dataset, trained, 1, 99), rtol=1e-12)
@@ -133,18 +126,18 @@ def test_a_single_value_gets_a_width(make_dataset, tmp_path):
     grid = dataset.assets["a"].grid
     grid[grid[..., 3] != 7, :3] = (1000, 1e6, 0.25)
     dataset.write_grid("a", grid)
-    build_store(of(dataset, ranges="p1-p99"), out)
+    build_store(dataset.parameters("p1-p99"), out)
     np.testing.assert_allclose(ranges_of(out), [[5.5, 6.5], [2.5, 3.5], [-0.25, 0.75]])
 
 
 def test_lists_and_ranges_of_no_use_are_told_before_any_work(make_dataset, tmp_path, steps):
     dataset, lists = make_dataset("a", "b"), tmp_path / "lists.json"
-    chosen = of(dataset, ranges="p1-p99", objects="train", split_by=str(lists))
+    chosen = dataset.parameters("p1-p99", normalize={"objects": "train", "split_by": str(lists)})
     for text, parameters, error, told in (
         ('{"train": ["a"]', chosen, InputError, "cannot be read"),
         ('{"train": ["nobody"]}', chosen, InputError, "none of the dataset's"),
         ('{"test": ["a"], "val": ["b"]}', chosen, ConfigError, "no object is trained on"),
-        ("", of(dataset, ranges=f"{tmp_path}/none.toml"), ConfigError, "cannot read ranges"),
+        ("", dataset.parameters(f"{tmp_path}/none.toml"), ConfigError, "cannot read ranges"),
     ):
         lists.write_text(text)
         with pytest.raises(error, match=told):
@@ -158,7 +151,7 @@ def test_a_range_that_cuts_off_most_values_is_told(make_dataset, tmp_path):
         "[youngs_modulus]\nlo = 20.0\nhi = 40.0\n[density]\nlo = 0.0\nhi = 9.0\n"
         "[poissons_ratio]\nlo = 0.0\nhi = 0.5\n"
     )
-    summary = build_store(of(dataset, ranges=str(file)), tmp_path / "s.zarr")
+    summary = build_store(dataset.parameters(str(file)), tmp_path / "s.zarr")
     (told,) = [one for one in summary.warnings if "beyond its range" in one]
     assert open_store(summary.store).normalization.source == "high.toml"
     assert told == (

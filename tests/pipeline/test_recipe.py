@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from support.commands import python
 
 from slatprep.judge.calibration import NUMBERS
 from slatprep.parameters import AlignParameters, SampleParameters
@@ -97,8 +98,7 @@ def test_numbers_beside_a_module_count(tmp_path, monkeypatch):
         numbers.write_text(text)
         digests.append(code_fingerprint.__wrapped__())
     assert len(set(digests)) == 3
-    shipped = numeric_modules()["slatprep.judge.calibration"]
-    assert shipped.with_suffix(".json") == NUMBERS
+    assert numeric_modules()["slatprep.judge.calibration"].with_suffix(".json") == NUMBERS
     assert NUMBERS.is_file()
 
 
@@ -135,8 +135,7 @@ def test_it_covers_every_module_that_an_asset_runs_through_and_is_the_same_elsew
         "print(*(m for m in sys.modules if m.startswith('slatprep'))); "
         "from slatprep.pipeline.fingerprint import code_fingerprint; print(code_fingerprint())"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    modules, key = told.stdout.splitlines()
+    modules, key = python("-c", code).stdout.splitlines()
     assert key == code_fingerprint()
     loaded = set(modules.split())
     # Packages that only gather names, words of errors, and values that the key holds.

@@ -103,8 +103,8 @@ def own(several: Dataset, tmp_path: Path) -> Dataset:
 
 def test_what_own_grids_of_merged_assets_are_measured_on_is_told(several, merged, plain, tmp_path):
     for name in "abc":
-        found = sorted((several.root / "pixieverse").glob(f"{name}/sample_0/material_grid.npy"))
-        shutil.copy(found[0], tmp_path / f"{name}.npy")
+        grid = several.root / f"pixieverse/{name}/sample_0/material_grid.npy"
+        shutil.copy(grid, tmp_path / f"{name}.npy")
     words, note = ("--split", "all", "--grids", f"m={tmp_path}", "--store"), "on the first of them"
     assert note in run("evaluate", *words, merged.store).stderr
     assert note not in run("evaluate", *words, plain.store).stderr
@@ -402,8 +402,7 @@ def test_joined_and_chosen_stores_keep_their_spread(merged, tmp_path):
     assert not open_store(tmp_path / "c.zarr").merges
     subset_store(merged.store, tmp_path / "a.zarr", ["a"])
     assert open_store(tmp_path / "a.zarr").asset("a").merged
-    other = Dataset(tmp_path / "other")
-    other.add("d", 2)
+    other = Dataset(tmp_path / "other").having("d", seed=2)
     other.write_grid("d", sample_grid(2, 100.0))
     build_store(other.parameters(), tmp_path / "d.zarr")
     concat_stores([tmp_path / "a.zarr", tmp_path / "d.zarr"], tmp_path / "joined.zarr")
@@ -420,15 +419,12 @@ def test_joined_and_chosen_stores_keep_their_spread(merged, tmp_path):
     assert verify_store(tmp_path / "joined.zarr").findings == ()
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"properties": [DENSITY | {"unit": "g/cm^3"}]}, "density in g/cm^3, log10"),
-        ({"properties": [DENSITY | {"scale": "linear"}]}, "density in kg/m^3, linear"),
-        ({"properties": [DENSITY | {"name": "damping"}]}, "the property damping, which"),
-        ({"classes": ["wood", "steel"]}, "the classes wood, steel"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"properties": [DENSITY | {"unit": "g/cm^3"}]}, "density in g/cm^3, log10"),
+    ({"properties": [DENSITY | {"scale": "linear"}]}, "density in kg/m^3, linear"),
+    ({"properties": [DENSITY | {"name": "damping"}]}, "the property damping, which"),
+    ({"classes": ["wood", "steel"]}, "the classes wood, steel"),
+])  # fmt: skip
 def test_tables_that_disagree_are_refused(own, tmp_path, changes, words):
     describe(own.root, **changes)
     with pytest.raises(ConfigError, match=r"\[\[also\]\] 1") as error:

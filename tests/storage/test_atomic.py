@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from support.faults import no_room
 from support.trees import copied, tree
 
 from slatprep import ConfigError, StoreError, build_store, subset_store
@@ -65,16 +66,13 @@ def refused(target: Path, fresh: bool = False) -> str:
 AS_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="gives something away")
 
 
-@pytest.mark.parametrize(
-    ("how", "told"),
-    [
-        ("link", ".s.zarr.work: is no folder"),
-        ("made by others", "holds notes.txt"),
-        pytest.param("another user's", "belongs to user 12345", marks=AS_ROOT),
-        ("spool is a link", "spool: is no folder"),
-        ("spool is a file", "spool: is no folder"),
-    ],
-)
+@pytest.mark.parametrize(("how", "told"), [
+    ("link", ".s.zarr.work: is no folder"),
+    ("made by others", "holds notes.txt"),
+    pytest.param("another user's", "belongs to user 12345", marks=AS_ROOT),
+    ("spool is a link", "spool: is no folder"),
+    ("spool is a file", "spool: is no folder"),
+])  # fmt: skip
 def test_a_work_folder_that_is_not_a_builds_own_is_refused(tmp_path, theirs, how, told):
     work = tmp_path / ".s.zarr.work"
     if how == "link":
@@ -126,10 +124,7 @@ def test_a_lock_in_a_folder_that_is_gone_is_not_looked_for_without_end(tmp_path,
 
 
 def test_a_lock_that_cannot_be_taken_leaves_nothing_open(tmp_path, monkeypatch):
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "pwrite", full)
+    monkeypatch.setattr(os, "pwrite", no_room)
     (tmp_path / "deep").write_text("[" * 4096)
     before = len(list(Path("/dev/fd").iterdir()))
     with pytest.raises(StoreError, match="holds something else than a lock"):
@@ -196,11 +191,7 @@ def test_what_to_do_about_a_disk_depends_on_what_it_says(code, advice):
 
 def test_a_full_disk_before_anything_is_written_is_told(tmp_path, monkeypatch):
     """Inodes may run out between the lock and the next folder."""
-
-    def none_left(*_: object, **__: object) -> str:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("tempfile.mkdtemp", none_left)
+    monkeypatch.setattr("tempfile.mkdtemp", no_room)
     assert f"{tmp_path} (No space left" in refused(tmp_path / "s.zarr")
 
 

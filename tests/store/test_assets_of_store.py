@@ -165,20 +165,17 @@ def test_an_asset_is_found_by_a_beginning_that_no_other_has(made):
     assert "cu" not in store and 3 not in store
 
 
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [
-        ("bear", r"did you mean bear\.front or bear\.side\?"),
-        ("be", r"2 ids begin with 'be', such as bear\.front, bear\.side; give more of it"),
-        ("BEAR.F", r"did you mean bear\.front\?"),
-        ("cupp", r"did you mean cup\?"),
-        ("", "has no asset ''; it has 4 assets"),
-        ("zebra", "it has 4 assets"),
-        ("4", "has no asset 4; it has 4 assets, numbered from 0"),
-        (4, "has no asset 4; it has 4 assets, numbered from 0"),
-        (-5, "has no asset -5"),
-    ],
-)
+@pytest.mark.parametrize(("name", "hint"), [
+    ("bear", r"did you mean bear\.front or bear\.side\?"),
+    ("be", r"2 ids begin with 'be', such as bear\.front, bear\.side; give more of it"),
+    ("BEAR.F", r"did you mean bear\.front\?"),
+    ("cupp", r"did you mean cup\?"),
+    ("", "has no asset ''; it has 4 assets"),
+    ("zebra", "it has 4 assets"),
+    ("4", "has no asset 4; it has 4 assets, numbered from 0"),
+    (4, "has no asset 4; it has 4 assets, numbered from 0"),
+    (-5, "has no asset -5"),
+])  # fmt: skip
 def test_a_name_that_none_or_several_have_is_answered(made, name, hint):
     store, _ = made
     with pytest.raises(UnknownAssetError, match=hint):
@@ -241,11 +238,9 @@ def test_a_field_has_the_annotated_cells_in_si_units(made):
     assert field.voxels.tolist() == [list(cell) for cell in cells]
     assert field.material.tolist() == [material[cell] for cell in cells]
     values = np.array([properties[:, *cell] for cell in cells], np.float64)
-    share = (values + 1) / 2
+    first, second, third = (values.T + 1) / 2
     # Ranges [2, 5], [3, 7] and [4, 9], the first two of log10.
-    expected = np.stack(
-        [10 ** (2 + 3 * share[:, 0]), 10 ** (3 + 4 * share[:, 1]), 4 + 5 * share[:, 2]], axis=1
-    )
+    expected = np.stack([10 ** (2 + 3 * first), 10 ** (3 + 4 * second), 4 + 5 * third], axis=1)
     np.testing.assert_allclose(field.properties, expected, rtol=1e-5)
     assert np.array_equal(store.asset("bear.side").normalised_field.properties, values)
     # What is occupied but not annotated is a part of the shape.

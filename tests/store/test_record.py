@@ -20,12 +20,7 @@ from slatprep.store import open_store
 from slatprep.store.attributes import RootAttributes, read_attributes, segments_of, width_findings
 from slatprep.store.layout import RECORDS_IN_CHUNK
 from slatprep.store.record import AssetRecord, BuildRecord, FailedRecord
-from slatprep.store.record_json import (
-    FOLDER,
-    RecordError,
-    read_record,
-    to_json,
-)
+from slatprep.store.record_json import FOLDER, RecordError, read_record, to_json
 from slatprep.store.records import StoredRecords
 
 
@@ -134,9 +129,8 @@ def test_text_that_is_no_json_is_refused():
 def test_what_is_unusual_of_a_merged_annotation_names_it():
     warnings = ["sample 2: unusual values: class sand has\n3 Pa", "unusual values: other", "a word"]
     assert oddities_in(warnings) == {"values": "sample 2: class sand has 3 Pa"}
-    assert oddities_in(["sample 0 has no unusual masks: none", "unusual masks: b"]) == {
-        "masks": "b"
-    }
+    masks = ["sample 0 has no unusual masks: none", "unusual masks: b"]
+    assert oddities_in(masks) == {"masks": "b"}
 
 
 def test_nan_is_null(record):
@@ -222,30 +216,27 @@ LONG = "x" * 200
 SAME = "property_columns and normalization must name the same properties"
 
 
-@pytest.mark.parametrize(
-    ("path", "value", "what", "expected"),
-    [
-        ("format", "other", "format is 'other'", "'slatprep-store'"),
-        ("format_version", 2, "format_version is 2", "1"),
-        ("normalization/hue/lo", "1", "normalization/hue/lo is '1'", "a valid number"),
-        ("normalization/hue/log10", "yes", "normalization/hue/log10 is 'yes'", "a valid boolean"),
-        ("normalization/hue/hi", -1.0, "normalization/hue is {", "lo must be less than hi"),
-        ("property_columns", ["density", "density"], " is {", SAME),
-        ("property_columns", ["density", "hue", "hue"], " is {", SAME),
-        ("property_columns", ["density", "taste"], " is {", SAME),
-        ("property_units", ["1"], " is {", "property_units must have a unit for each of"),
-        ("latents/mean", [0.0], "latents is {", "a mean and a std above 0 for each of 8"),
-        ("latents/channels", 0, "latents/channels is 0", ""),
-        ("property_columns/0", "E [Pa]", "property_columns/0 is 'E [Pa]'", ""),
-        ("manifest", LONG, f"manifest is '{LONG[:99]}", ""),
-        ("manifest", GONE, "manifest is missing", ""),
-        ("build/versions", GONE, "build/versions is missing", ""),
-        ("build/parameters", GONE, "build/parameters is missing", ""),
-        ("build/parameters", 5, "build/parameters is 5", ""),
-        ("build/parameters", {"sample": 5}, "build/parameters", ""),
-        ("build/parameters", {"sample": None}, "build/parameters", ""),
-    ],
-)
+@pytest.mark.parametrize(("path", "value", "what", "expected"), [
+    ("format", "other", "format is 'other'", "'slatprep-store'"),
+    ("format_version", 2, "format_version is 2", "1"),
+    ("normalization/hue/lo", "1", "normalization/hue/lo is '1'", "a valid number"),
+    ("normalization/hue/log10", "yes", "normalization/hue/log10 is 'yes'", "a valid boolean"),
+    ("normalization/hue/hi", -1.0, "normalization/hue is {", "lo must be less than hi"),
+    ("property_columns", ["density", "density"], " is {", SAME),
+    ("property_columns", ["density", "hue", "hue"], " is {", SAME),
+    ("property_columns", ["density", "taste"], " is {", SAME),
+    ("property_units", ["1"], " is {", "property_units must have a unit for each of"),
+    ("latents/mean", [0.0], "latents is {", "a mean and a std above 0 for each of 8"),
+    ("latents/channels", 0, "latents/channels is 0", ""),
+    ("property_columns/0", "E [Pa]", "property_columns/0 is 'E [Pa]'", ""),
+    ("manifest", LONG, f"manifest is '{LONG[:99]}", ""),
+    ("manifest", GONE, "manifest is missing", ""),
+    ("build/versions", GONE, "build/versions is missing", ""),
+    ("build/parameters", GONE, "build/parameters is missing", ""),
+    ("build/parameters", 5, "build/parameters is 5", ""),
+    ("build/parameters", {"sample": 5}, "build/parameters", ""),
+    ("build/parameters", {"sample": None}, "build/parameters", ""),
+])  # fmt: skip
 def test_what_is_wrong_is_told_by_its_name(path, value, what, expected):
     found = read_attributes(placed(said(), path, value))
     assert isinstance(found, tuple)

@@ -110,9 +110,8 @@ def test_a_column_of_fill_values_alone_needs_no_file(tmp_path, shard, monkeypatc
     make(tmp_path, "asset/category", np.array([""] * 9, object), 3, shard, "")
     assert not (tmp_path / "asset/category/c").exists()
     reader = reader_of(folder := WatchedFolder(tmp_path), "asset/category")
-    with pytest.raises(
-        StoreError, match=r"asset/category/c/0: is missing \(was the store replaced"
-    ):
+    told = r"asset/category/c/0: is missing \(was the store replaced"
+    with pytest.raises(StoreError, match=told):
         reader.read(0, 2)
     reader.listed = {"asset/category/c/1"}
     assert reader.read(1, 3).tolist() == [""] * 2

@@ -38,19 +38,16 @@ def test_shards_take_every_row_of_every_asset_once_and_in_place(sizes, per_shard
     assert end == offsets[-1]
 
 
-@pytest.mark.parametrize(
-    ("rows", "chunk", "chunks"),
-    [
-        (0, 4096, 64),  # 262,144 rows at least
-        (64 * 32 * 4096, 4096, 64),
-        (64 * 32 * 4096 + 1, 4096, 128),  # 32 shards would not take the last row
-        (128 * 32 * 4096, 4096, 128),
-        (3000 * 32 * 4096, 4096, 4096),
-        (10**12, 4096, 4096),  # 16.8 million rows at most
-        (64 * 32 * 128 + 1, 128, 128),
-        (10**12, 2**20, MAX_VOXEL_SHARD // 2**20),
-    ],
-)
+@pytest.mark.parametrize(("rows", "chunk", "chunks"), [
+    (0, 4096, 64),  # 262,144 rows at least
+    (64 * 32 * 4096, 4096, 64),
+    (64 * 32 * 4096 + 1, 4096, 128),  # 32 shards would not take the last row
+    (128 * 32 * 4096, 4096, 128),
+    (3000 * 32 * 4096, 4096, 4096),
+    (10**12, 4096, 4096),  # 16.8 million rows at most
+    (64 * 32 * 128 + 1, 128, 128),
+    (10**12, 2**20, MAX_VOXEL_SHARD // 2**20),
+])  # fmt: skip
 def test_a_shard_holds_the_least_power_of_two_of_chunks(rows, chunk, chunks):
     parameters = StoreParameters(voxel_chunk=chunk)
     assert rows_per_shard(parameters, rows) == chunk * chunks
@@ -110,9 +107,7 @@ def test_chunks_are_held_that_have_the_same_bytes(drawn, size):
 @given(drawn=arrays_and_runs(), chunk=st.integers(1, 4), chunks=st.integers(1, 4))
 def test_shards_are_pieced_together_from_what_is_the_same(drawn, chunk, chunks):
     old, new, runs = drawn
-    parameters = StoreParameters(
-        voxel_chunk=chunk, voxel_chunks_per_shard=chunks, grid_assets_per_shard=1
-    )
+    parameters = StoreParameters(chunk, chunks, grid_assets_per_shard=1)
     cut = [
         shard
         for shard in shards(["a"], [0, len(new)], parameters, {"voxel": runs}, {("voxel", 0)})

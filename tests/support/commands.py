@@ -1,7 +1,10 @@
-"""Commands in this process, as a user types them."""
+"""Commands as a user types them, in this process, and programs in another one."""
 
 import json
+import os
 import shlex
+import subprocess
+import sys
 from typing import Any
 
 import click
@@ -27,6 +30,16 @@ def refused(*words: object, code: int = 2) -> str:
 def document(*words: object, code: int = 0) -> Any:
     """Return what a command prints as JSON."""
     return json.loads(run(*words, "--json", code=code).stdout)
+
+
+def python(*words: object, code: int = 0, **variables: str) -> "subprocess.CompletedProcess[str]":
+    """Run Python, which ends with this exit code, with more variables in its environment."""
+    done = subprocess.run(
+        [sys.executable, *map(str, words)],
+        capture_output=True, text=True, check=False, env=os.environ | variables,
+    )  # fmt: skip
+    assert done.returncode == code, (words, done.stdout, done.stderr)
+    return done
 
 
 def parse_command(line: str) -> None:

@@ -133,12 +133,7 @@ class Processes:
             end(process)
 
     def _start(self, *arguments: str, path: str = "", **variables: str) -> subprocess.Popen[bytes]:
-        paths = (
-            path,
-            str(self.folder),
-            str(Path(__file__).parents[1] / "workers"),
-            os.environ.get("PYTHONPATH", ""),
-        )
+        paths = path, str(self.folder), os.environ.get("PYTHONPATH", "")
         environment = {
             **os.environ,
             "SLATPREP_FAULTS": "faults:reached",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from support.synthetic import JELLY, METAL
+from support.trees import files_below
 
 
 def index_of(directory: Path) -> list[dict[str, Any]]:
@@ -14,10 +15,7 @@ def index_of(directory: Path) -> list[dict[str, Any]]:
 
 
 def bytes_of(path: Path) -> dict[str, bytes]:
-    if path.is_file():
-        return {"": path.read_bytes()}
-    files = (file for file in path.rglob("*") if file.is_file())
-    return {file.relative_to(path).as_posix(): file.read_bytes() for file in files}
+    return {name: file.read_bytes() for name, file in files_below(path).items()}
 
 
 def hold_truth(

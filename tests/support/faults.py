@@ -1,10 +1,12 @@
 """Faults injected into builds, through the seam of `slatprep.storage.faults`."""
 
+import errno
 import os
 import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,6 +27,11 @@ def inject(monkeypatch: pytest.MonkeyPatch, fault: Fault) -> None:
     """Have builds in this process call a function at each of their steps."""
     monkeypatch.setattr(f"{__name__}._here", [*_here, fault])
     monkeypatch.setenv(VARIABLE, f"{__name__}:call")
+
+
+def no_room(*_: object, **__: object) -> Any:
+    """Fail as what writes does on a full disk."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def flip(path: Path, at: int, bit: int = 0) -> None:

@@ -1,6 +1,5 @@
 """What a build that knows of no other writes: made once for the same sources and parameters."""
 
-import hashlib
 import tempfile
 from pathlib import Path
 
@@ -16,12 +15,8 @@ def tree_from_nothing(parameters: BuildParameters, patched: str = "") -> dict[st
     said = f"{patched} {parameters}"
     for path in (parameters.pixieverse.root, parameters.slat.root, parameters.pairing.categories):
         if path is not None:
-            said = said.replace(str(path), repr(sorted(_content(Path(path)).items())))
+            said = said.replace(str(path), repr(sorted(tree(Path(path)).items())))
     if said not in _trees:
         with tempfile.TemporaryDirectory() as folder:
             _trees[said] = tree(build_store(parameters, Path(folder, "s.zarr")).store)
     return _trees[said]
-
-
-def _content(path: Path) -> dict[str, str]:
-    return tree(path) if path.is_dir() else {"": hashlib.sha256(path.read_bytes()).hexdigest()}

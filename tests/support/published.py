@@ -26,6 +26,13 @@ def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     archive.addfile(member, io.BytesIO(data))
 
 
+def add_link(tar: tarfile.TarFile, name: str, target: str, kind: bytes = tarfile.LNKTYPE) -> None:
+    """Add a link to an archive, or a member of another kind that has no data."""
+    member = tarfile.TarInfo(name)
+    member.type, member.linkname = kind, target
+    tar.addfile(member)
+
+
 def write_object(folder: Path, grid: np.ndarray, seed: int = 0) -> None:
     """Write the files of an object that lie beside its grid, small ones in place of large."""
     rng = np.random.default_rng(seed)
@@ -51,9 +58,14 @@ def publish(objects: Path, root: Path, suffix: str = ".tar") -> Path:
     return folder
 
 
+def writing(path: Path) -> tarfile.TarFile:
+    """Open a new archive, with gzip where its name says so."""
+    return tarfile.open(path, "w:gz" if path.suffix == ".gz" else "w")
+
+
 def pack(path: Path, objects: Iterable[Path]) -> None:
     """Write an archive of objects."""
-    with tarfile.open(path, "w:gz" if path.suffix == ".gz" else "w") as archive:
+    with writing(path) as archive:
         for one in objects:
             archive.add(one, arcname=one.name)
 

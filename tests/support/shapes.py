@@ -5,22 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from slatprep import Alignment, Annotation, MaterialField, Quality, StructuredLatents
 from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of
 from slatprep.parameters import SampleParameters
 from slatprep.pipeline.annotate import look_up
-from slatprep.records import (
-    UNANNOTATED,
-    Alignment,
-    Annotation,
-    Engine,
-    Judgement,
-    MaterialField,
-    Model,
-    Placement,
-    Quality,
-    Search,
-    StructuredLatents,
-)
+from slatprep.records import UNANNOTATED, Engine, Judgement, Model, Placement, Search
 
 GRID = np.stack(np.meshgrid(*[np.arange(64)] * 3, indexing="ij"), axis=-1)
 

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -135,6 +135,16 @@ class Dataset:
         )
         changed = {name: replace(getattr(usual, name), **group) for name, group in groups.items()}
         return replace(usual, **changed)
+
+
+def definition(parameters: BuildParameters) -> str:
+    """Return the text of a definition with these roots, ranges and shards."""
+    shards = "".join(f"{name} = {value}\n" for name, value in asdict(parameters.store).items())
+    return (
+        f'[pixieverse]\nroot = "{parameters.pixieverse.root}"\n'
+        f'[slat]\nroot = "{parameters.slat.root}"\n'
+        f'[normalize]\nranges = "{parameters.normalize.ranges}"\n[store]\n{shards}'
+    )
 
 
 Made = tuple[Dataset, Path]

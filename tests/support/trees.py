@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 
-def tree(directory: Path | None) -> dict[str, str]:
-    """Return the hash of every file below a directory."""
-    assert directory is not None
-    return {
-        path.relative_to(directory).as_posix(): digest(path.read_bytes())
-        for path in directory.rglob("*")
-        if path.is_file()
-    }
+def files_below(place: Path | None) -> dict[str, Path]:
+    """Return every file below a directory by its name relative to that, or the one file itself."""
+    assert place is not None
+    below = [place] if place.is_file() else filter(Path.is_file, place.rglob("*"))
+    return {path.relative_to(place).as_posix(): path for path in below}
+
+
+def tree(place: Path | None) -> dict[str, str]:
+    """Return the hash of every file below a directory, or of a file."""
+    return {name: digest(path.read_bytes()) for name, path in files_below(place).items()}
 
 
 def copied(store: Path, to: Path) -> Path:
@@ -25,8 +27,7 @@ def copied(store: Path, to: Path) -> Path:
 
 def inodes(directory: Path) -> dict[str, int]:
     """Return the inode of every file below a directory."""
-    files = (path for path in directory.rglob("*") if path.is_file())
-    return {path.relative_to(directory).as_posix(): path.stat().st_ino for path in files}
+    return {name: path.stat().st_ino for name, path in files_below(directory).items()}
 
 
 def contents(s3: Any, place: str) -> dict[str, str]:

@@ -16,7 +16,7 @@ import pytest
 from support.commands import run
 from support.dask_processes import Processes, end, threads_for_workers, wait_for_workers
 from support.faults import flip, wait_until
-from support.synthetic import Dataset, Made
+from support.synthetic import Dataset, Made, definition
 from support.trees import tree
 
 import slatprep
@@ -67,11 +67,7 @@ def test_a_build_whose_workers_are_killed_gives_the_same_bytes(shared, address, 
     (faults / "hold-c").touch()
     once.touch()
     parameters = dataset.root.parent / "dataset.toml"
-    parameters.write_text(
-        '[pixieverse]\nroot = "sources/pixieverse"\n[slat]\nroot = "sources/slat"\n'
-        '[normalize]\nranges = "pixie"\n[store]\nvoxel_chunk = 128\nvoxel_chunks_per_shard = 4\n'
-        "grid_assets_per_shard = 2\ncompression_level = 1\n"
-    )
+    parameters.write_text(definition(dataset.parameters("pixie")))
     build = subprocess.Popen(
         [sys.executable, "-m", "slatprep", "build-store", "--config", str(parameters),
          "--out", "s.zarr", "--scheduler", address],
@@ -234,8 +230,3 @@ def test_the_first_worker_is_waited_for():
             assert list(run_unordered(divmod, [(7, 2)], cluster)) == [(3, 1)]
         address = started.scheduler_address
     assert lines == [f"{address}: has no worker yet; waiting for the first", f"{address}: 1 worker"]
-
-
-def test_jobs_and_scheduler_exclude_each_other():
-    options = ("--jobs", 2, "--scheduler", "tcp://127.0.0.1:1", "--out", "s.zarr")
-    assert "--jobs is for this machine" in run("build-store", *options, code=2).output

@@ -7,7 +7,6 @@ import json
 import os
 import re
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from PIL import Image
+from support.faults import wait_until
 from support.made_store import edit_record, rewrite
 from support.pages import HOSTILE, Page, Report
 from support.synthetic import Dataset, MakeDataset
 
 from slatprep.inspect.report import write_report
 from slatprep.inspect.verify import verify_store
-from slatprep.parameters import BuildParameters, PairingParameters, PixieverseSource, SlatSource
 from slatprep.pipeline.dataset import BuildSummary, build_store
 from slatprep.store import open_store
 from slatprep.store.records import manifests_of
@@ -34,21 +33,12 @@ pytest.importorskip("selenium")
 
 LIBRARY = '<script type="text/plain" id="library">'
 
-PATIENCE = 600  # A loaded machine draws 3D slowly without a graphics card.
-
-
-def wait(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "the page did not get there"
-        time.sleep(0.05)
-
 
 def open_page(browser: Chrome, report: Report, end: str = "") -> None:
     browser.get("about:blank")  # else a change of the address' end loads nothing
     browser.get(report.path.as_uri() + end)
     ready = "return performance.getEntriesByName('slatprep-ready').length"
-    wait(lambda: browser.execute_script(ready))
+    wait_until(lambda: browser.execute_script(ready))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +104,7 @@ def drawn(browser: Chrome) -> Callable[[], bytes]:
     def pixels() -> bytes:
         return bytes(canvas.screenshot_as_png)
 
-    wait(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
+    wait_until(lambda: len(Image.open(io.BytesIO(pixels())).convert("P").getcolors() or ()) > 8)
     return pixels
 
 
@@ -181,7 +171,7 @@ def test_a_good_verdict_is_no_more_than_it_rests_on(opened):
     assert unusual.text == "⚠ unusual 1"
     # A page that still moves would have a pointer miss it.
     opened.execute_script("arguments[0].click()", unusual)
-    wait(lambda: rows(opened) == ["cup"])
+    wait_until(lambda: rows(opened) == ["cup"])
     row = opened.find_element("css selector", "tbody tr:not(.space)")
     assert "⚠" in row.text and f"unusual masks: {HOSTILE}" in row.text
     row.click()
@@ -209,12 +199,11 @@ def test_a_reason_is_shown_without_its_path(browser, mixed_build, tmp_path):
 
 
 def test_each_line_of_reasons_shows_its_own_assets(browser, copy, tmp_path):
-    why = {"reasons": ["only 51.4% of the labels can be expected to be right"]}
+    why = ["only 51.4% of the labels can be expected to be right"]
     for row, verdict in enumerate(("doubtful", "failed", "failed")):
         rewrite(copy, "asset/verdict", row, verdict)
-        edit_record(
-            copy, row, lambda one, verdict=verdict: one["judgement"].update(why, verdict=verdict)
-        )
+        said = {"reasons": why, "verdict": verdict}
+        edit_record(copy, row, lambda one, said=said: one["judgement"].update(said))
     page = Report(copy, Path(str(manifests_of(copy))), tmp_path / "page.html")
     write_report(open_store(copy), page.path, manifests=page.manifests)
     open_page(browser, page)
@@ -245,8 +234,7 @@ def test_it_opens_an_asset_that_turns(opened):
     from selenium.webdriver.common.keys import Keys
 
     click(opened, "[data-sort=id]")
-    row = opened.find_element("css selector", "tbody tr:not(.space)")
-    row.send_keys(Keys.ARROW_DOWN)
+    opened.find_element("css selector", "tbody tr:not(.space)").send_keys(Keys.ARROW_DOWN)
     opened.switch_to.active_element.send_keys(Keys.ENTER)
     title = opened.find_element("id", "asset-title")
     assert title.text.startswith("bear.front")
@@ -254,24 +242,24 @@ def test_it_opens_an_asset_that_turns(opened):
     front = pixels()
     assert opened.find_element("id", "scale").text.split() == ["jelly", "metal"]
     canvas.send_keys(Keys.ARROW_RIGHT * 4)
-    wait(lambda: pixels() != front)
+    wait_until(lambda: pixels() != front)
     still = pixels()
     click(opened, "[data-mode=youngs_modulus]")
-    wait(lambda: pixels() != still)
+    wait_until(lambda: pixels() != still)
     assert "Pa" in opened.find_element("id", "scale").text
     click(opened, "[data-switch=turning]")
     moving = pixels()
-    wait(lambda: pixels() != moving)
+    wait_until(lambda: pixels() != moving)
     click(opened, "[data-switch=turning]")
     for switch in ("field", "before", "before", "slat"):
         before = pixels()
         click(opened, f"[data-switch={switch}]")
-        wait(lambda before=before: pixels() != before)
+        wait_until(lambda before=before: pixels() != before)
     click(opened, "#next")
-    wait(lambda: title.text.startswith("bear.side"))
+    wait_until(lambda: title.text.startswith("bear.side"))
     assert opened.current_url.endswith("#asset=bear.side")
     canvas.send_keys(Keys.ESCAPE)
-    wait(lambda: not opened.execute_script("return document.getElementById('asset').open"))
+    wait_until(lambda: not opened.execute_script("return document.getElementById('asset').open"))
     assert_quiet(opened)
 
 
@@ -311,9 +299,7 @@ def test_an_asset_without_a_picture_says_why_it_is_not_there(opened):
     assert_quiet(opened)
 
 
-def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
-    browser, deformed_build, tmp_path
-):
+def test_a_deformed_asset_is_found_and_shown_through_its_map(browser, deformed_build, tmp_path):
     open_page(browser, page_of(deformed_build, tmp_path / "page.html"))
     assert set(rows(browser)) == {"bent", "long"}
     click(browser, "[data-sort=model]")
@@ -330,20 +316,19 @@ def test_a_deformed_asset_is_found_by_its_model_and_shown_through_its_map(
     click(browser, "[data-switch=slat]")
     after = pixels()
     click(browser, "[data-switch=before]")
-    wait(lambda: pixels() != after)
+    wait_until(lambda: pixels() != after)
     click(browser, "[data-switch=before]")
-    wait(lambda: pixels() == after)
+    wait_until(lambda: pixels() == after)
     assert_quiet(browser)
 
 
-def test_tied_placements_are_stepped_through(browser, mixed_build, tmp_path):
-    store = Path(shutil.copytree(mixed_build.store, tmp_path / "mixed.zarr"))
+def test_tied_placements_are_stepped_through(browser, copy, tmp_path):
     turned = np.diag([-1.0, -1.0, 1.0, 1.0]).tolist()
     placements = [{"transform": turned, "score": 1.0, "displacement": 40.0}]
-    row = open_store(store).ids.index("cup")
-    edit_record(store, row, lambda record: record["alignment"].update(placements=placements))
+    row = open_store(copy).ids.index("cup")
+    edit_record(copy, row, lambda record: record["alignment"].update(placements=placements))
     path = tmp_path / "page.html"
-    write_report(open_store(store), path, manifests=mixed_build.records.parent)
+    write_report(open_store(copy), path, manifests=manifests_of(copy))
     browser.get("about:blank")
     browser.get(f"{path.as_uri()}#asset=cup")
     pixels = drawn(browser)
@@ -353,11 +338,11 @@ def test_tied_placements_are_stepped_through(browser, mixed_build, tmp_path):
     click(browser, "[data-switch=slat]")
     taken = pixels()
     click(browser, "#ties button:nth-of-type(2)")
-    wait(lambda: pixels() != taken)
+    wait_until(lambda: pixels() != taken)
     click(browser, "#ties button:nth-of-type(1)")
-    wait(lambda: pixels() == taken)
+    wait_until(lambda: pixels() == taken)
     click(browser, "#next")
-    wait(lambda: browser.find_element("id", "asset-title").text.startswith("dog"))
+    wait_until(lambda: browser.find_element("id", "asset-title").text.startswith("dog"))
     assert not browser.find_element("id", "ties").is_displayed()
     assert_quiet(browser)
 
@@ -407,13 +392,9 @@ def merged(make_dataset: MakeDataset, tmp_path: Path) -> BuildSummary:
         for sample, factor in enumerate(factors):
             grid = dataset.assets[name].grid.copy()
             grid[grid[..., 3] != 7, 1] *= factor
-            path = dataset.root / "pixieverse" / name / f"sample_{sample}" / "material_grid.npy"
-            path.parent.mkdir(exist_ok=True)
-            np.save(path, grid)
+            dataset.write_grid(name, grid, sample)
     (dataset.root / "pixieverse/b/sample_2/material_grid.npy").write_bytes(b"torn")
-    parameters = dataset.parameters()
-    source = replace(parameters.pixieverse, samples="merge")
-    return build_store(replace(parameters, pixieverse=source), tmp_path / "s.zarr")
+    return build_store(dataset.parameters(pixieverse={"samples": "merge"}), tmp_path / "s.zarr")
 
 
 def test_assets_say_how_many_annotations_agree(merged, browser, tmp_path):
@@ -491,12 +472,9 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Report:
     kinds = (HOSTILE, "__proto__", f"{HOSTILE}\u2028`${{window.broken = 1}}")
     categories = {name: {"obj_class": kind} for name, kind in zip(SOUND, kinds, strict=True)}
     (root / "categories.json").write_text(json.dumps(categories))
-    parameters = BuildParameters(
-        PixieverseSource(root / "voxels", adapter="voxels"),
-        SlatSource(root / "slat"),
-        pairing=PairingParameters(categories=root / "categories.json"),
-        name=HOSTILE,
-    )
+    source = {"root": root / "voxels", "adapter": "voxels"}
+    pairing = {"categories": root / "categories.json"}
+    parameters = replace(dataset.parameters(pixieverse=source, pairing=pairing), name=HOSTILE)
     summary = build_store(parameters, root / f"{IN_NAMES}.zarr")
     assert summary.statuses["ok"] == len(SOUND)
     assert verify_store(root / f"{IN_NAMES}.zarr", sources=True).findings == ()

@@ -20,7 +20,7 @@ from support.made_store import rewrite
 from support.pages import HOSTILE, Page
 from support.synthetic import QUARTER_TURN
 
-from slatprep.errors import StoreError
+from slatprep import StoreError, open_store
 from slatprep.geometry.frames import apply_transform, make_transform, voxel_centres
 from slatprep.inspect import report
 from slatprep.inspect.overview import overview_of
@@ -28,7 +28,6 @@ from slatprep.inspect.report import write_report
 from slatprep.inspect.report.content import kinds_of, nearest_quarter_turn, quarter_turns
 from slatprep.inspect.report.drawn import encode_asset
 from slatprep.records import RESOLUTION, UNANNOTATED
-from slatprep.store import open_store
 from slatprep.store.records import StoredRecords
 
 IDS = ["ant", "bear.front", "bear.side", "cup", "dog"]

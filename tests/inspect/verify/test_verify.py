@@ -14,11 +14,9 @@ from support.faults import flip
 from support.made_store import edit_json, edit_record, placed, rewrite
 from support.shapes import surface_latents
 
-from slatprep.errors import StoreError
+from slatprep import StoreError, build_store, open_store
 from slatprep.inspect.verify import Finding, SourceRoots, index_findings, verify_store
 from slatprep.inspect.verify.manifests import manifest_findings
-from slatprep.pipeline.dataset import build_store
-from slatprep.store import open_store
 
 
 @pytest.fixture
@@ -336,27 +334,23 @@ def test_what_build_json_says_of_the_store_is_compared(store):
 
 
 def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
-    parameters = mixed.parameters()
-    roots = SourceRoots(tmp_path / "pixieverse", tmp_path / "slat")
-    shutil.copytree(parameters.pixieverse.root, roots.pixieverse)
-    shutil.copytree(parameters.slat.root, roots.slat)
+    own = Path(shutil.copytree(mixed.root, tmp_path / "own"))
+    roots = SourceRoots(own / "pixieverse", own / "slat")
     result = verify_store(store, sources=True, roots=roots)
     assert result.ok
     assert result.sources == 10
     grid, slat = roots.pixieverse / "ant/sample_0/material_grid.npy", roots.slat / "cup.npz"
     flip(grid, 1000)
     slat.unlink()
-    findings = found(store, sources=True, roots=roots)
-    assert [(f.file, f.asset, f.what) for f in findings] == [
+    assert [(f.file, f.asset, f.what) for f in found(store, sources=True, roots=roots)] == [
         (str(grid), "ant", "its bytes changed"),
         (str(slat), "cup", "does not exist"),
     ]
 
 
 def test_a_second_look_remembers_nothing_of_the_first(store, mixed, tmp_path):
-    parameters = mixed.parameters()
-    roots = SourceRoots(parameters.pixieverse.root, tmp_path / "slat")
-    shutil.copytree(parameters.slat.root, roots.slat)
+    roots = SourceRoots(mixed.root / "pixieverse", tmp_path / "slat")
+    shutil.copytree(mixed.root / "slat", roots.slat)
     assert verify_store(store, roots=roots, sources=True).ok
     slat = roots.slat / "ant.npz"
     times = slat.stat().st_atime_ns, slat.stat().st_mtime_ns

@@ -28,23 +28,20 @@ from slatprep.storage.remote import (
 )
 
 
-@pytest.mark.parametrize(
-    ("place", "shown"),
-    [
-        ("s3://bucket/a/b.zarr", "s3://bucket/a/b.zarr"),
-        (Path("s3://bucket/a"), "s3://bucket/a"),  # pathlib has made one slash of two
-        ("gs://bucket", "gs://bucket"),
-        ("s3a://bucket/a", "s3://bucket/a"),  # other names of the same place
-        ("S3://bucket/A", "s3://bucket/A"),
-        ("gcs://bucket", "gs://bucket"),
-        ("memory://a/", "memory://a"),
-        ("demo.zarr", "demo.zarr"),
-        ("/data/demo.zarr", "/data/demo.zarr"),
-        ("file:///data/demo.zarr", "/data/demo.zarr"),
-        (Path("file:///data/demo.zarr"), "/data/demo.zarr"),
-        ("C:/data", "C:/data"),
-    ],
-)
+@pytest.mark.parametrize(("place", "shown"), [
+    ("s3://bucket/a/b.zarr", "s3://bucket/a/b.zarr"),
+    (Path("s3://bucket/a"), "s3://bucket/a"),  # pathlib has made one slash of two
+    ("gs://bucket", "gs://bucket"),
+    ("s3a://bucket/a", "s3://bucket/a"),  # other names of the same place
+    ("S3://bucket/A", "s3://bucket/A"),
+    ("gcs://bucket", "gs://bucket"),
+    ("memory://a/", "memory://a"),
+    ("demo.zarr", "demo.zarr"),
+    ("/data/demo.zarr", "/data/demo.zarr"),
+    ("file:///data/demo.zarr", "/data/demo.zarr"),
+    (Path("file:///data/demo.zarr"), "/data/demo.zarr"),
+    ("C:/data", "C:/data"),
+])  # fmt: skip
 def test_a_url_is_a_place_that_shows_as_a_url_and_all_else_a_local_path(place, shown):
     path = place_of(place)
     assert isinstance(path, RemotePlace if "://" in shown else Path)

@@ -12,6 +12,7 @@ from support.dask_processes import Processes, end, wait_for_workers
 from support.faults import environment as with_fault
 from support.faults import wait_until
 from support.remote import current, put, raising, versions
+from support.synthetic import definition
 from support.trees import contents, tree
 
 from slatprep.errors import SlatprepError, StoreError
@@ -58,12 +59,7 @@ def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_
 ):
     faults = shared[0].folder
     put(another[1], url)
-    (tmp_path / "dataset.toml").write_text(
-        f'[pixieverse]\nroot = "{uploaded.pixieverse.root}"\n'
-        f'[slat]\nroot = "{uploaded.slat.root}"\n'
-        '[normalize]\nranges = "pixie"\n[store]\nvoxel_chunk = 512\nvoxel_chunks_per_shard = 4\n'
-        "grid_assets_per_shard = 2\ncompression_level = 1\n"
-    )
+    (tmp_path / "dataset.toml").write_text(definition(uploaded))
 
     def build(fault: str = "") -> subprocess.Popen[bytes]:
         command = ["build-store", "--config", "dataset.toml", "--out", url, "--scheduler", address]
