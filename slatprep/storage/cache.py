@@ -19,6 +19,7 @@ from slatprep.storage.files import file_digest
 from slatprep.storage.remote import (
     RemotePlace,
     connected,
+    get_objects,
     list_objects,
     multipart_options,
     stamp_of,
@@ -97,12 +98,7 @@ def copied_version(place: RemotePlace) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as own:
             part = Path(own, "part")
-            with connected(place) as (system, root):
-                system.get(
-                    [f"{root}/{name}" for name in objects],
-                    [str(part / name) for name in objects],
-                    **multipart_options(system, files_at_once=4),
-                )
+            get_objects(place, part, objects)
             for name, entry in objects.items():
                 if (part / name).stat().st_size != entry["size"]:
                     raise StoreError(f"{place / name}: changed while it was copied; run again")

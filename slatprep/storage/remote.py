@@ -277,6 +277,17 @@ def put_objects(folder: Path, place: RemotePlace, names: Iterable[str]) -> None:
         list(pool.map(put, names))
 
 
+def get_objects(place: RemotePlace, folder: Path, names: Iterable[str]) -> None:
+    """Get objects below a place into a folder, under the same names, a few at a time."""
+    with connected(place) as (system, root), ThreadPoolExecutor(_LARGE_AT_ONCE) as pool:
+
+        def get(name: str) -> None:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            system.get_file(f"{root}/{name}", str(folder / name), **multipart_options(system))
+
+        list(pool.map(get, names))
+
+
 def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str]) -> None:
     """Have the server copy objects below a place to another, under the same names."""
     if names := list(names):
@@ -307,8 +318,8 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
                 raise OSError(errno.EACCES, kept["Message"], kept["Key"])
 
 
-_FILES_AT_ONCE, _REMOVED_AT_ONCE = 16, 1000
-"""Number of requests at a time, and of objects that S3 removes in one of them."""
+_FILES_AT_ONCE, _LARGE_AT_ONCE, _REMOVED_AT_ONCE = 16, 4, 1000
+"""Numbers of small and of large files at a time, and of objects that S3 removes in a request."""
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 """Advice if S3 finds no credentials."""
@@ -318,15 +329,12 @@ def _is_plain(name: str) -> bool:
     return not {"", ".", ".."} & set(name.split("/")) and "\\" not in name and "\0" not in name
 
 
-def multipart_options(system: Any, files_at_once: int | None = None) -> dict[str, int]:
+def multipart_options(system: Any) -> dict[str, int]:
     """Return options that limit the memory of a transfer, to 64 MiB per file on S3.
 
-    S3 takes 10,000 parts, so 160 GiB per file. `files_at_once` is for transfers of several files.
+    S3 takes 10,000 parts, so 160 GiB per file.
     """
-    parts = {"chunksize": PART_BYTES, "max_concurrency": 4} if "s3" in system.protocol else {}
-    if files_at_once is None or not system.async_impl:
-        return parts
-    return parts | {"batch_size": files_at_once}
+    return {"chunksize": PART_BYTES, "max_concurrency": 4} if "s3" in system.protocol else {}
 
 
 @contextmanager
