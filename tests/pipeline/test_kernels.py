@@ -110,8 +110,12 @@ def test_no_process_goes_on_compiling_after_an_interrupt(tmp_path):
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
         wait_until(children.read_text)
         (helper,) = map(int, children.read_text().split())
-        process.send_signal(signal.SIGINT)
-        assert process.wait(300) != 0
+        for _ in range(30):  # One that falls into a callback of LLVM is lost.
+            process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(10)
+                break
+        assert process.poll()
         wait_until(lambda: not _runs(helper), 5)
 
 
