@@ -30,9 +30,6 @@ _ONLY_FOR = {
 }
 
 
-_HALF = "{} holds files of the old export, the new one, or both; run it again"
-
-
 @dataclass(frozen=True, kw_only=True)
 class FormatOptions:
     """Options of some formats; None takes the format's own default.
@@ -116,6 +113,7 @@ def export(
     """
     given = format_options.of(kind)
     from slatprep.export import ExportOptions, export_store
+    from slatprep.export.target import HALF
     from slatprep.records import USABLE
 
     left_out: list[str] = []
@@ -133,7 +131,7 @@ def export(
         verdicts = USABLE
     if split != "all":
         assets = tuple(opened.ids[row] for row in rows)
-    output.if_stopped = _HALF.format(out)
+    output.if_stopped = HALF.format(out)
     with output.progress("export") as progress:
         summary = export_store(
             opened,
@@ -200,6 +198,7 @@ def publish(
     """
     from slatprep.export.croissant import Stated
     from slatprep.export.publish import publish_store
+    from slatprep.export.target import HALF
     from slatprep.records import USABLE
 
     if verdicts is not None and data == "store":
@@ -210,7 +209,7 @@ def publish(
     chosen = USABLE if verdicts is None and data == "webdataset" else verdicts or ()
     rows = [row for row, kept in enumerate(opened.having(chosen)) if kept]
     drawn = {"assets.png": _picture(opened, rows, pictures)} if pictures and rows else {}
-    output.if_stopped = _HALF.format(out)
+    output.if_stopped = HALF.format(out)
     with output.progress("publish") as progress:
         summary = publish_store(
             opened,

@@ -11,7 +11,7 @@ from typing import Any
 
 import orjson
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, StoreError
 from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged, writing
 from slatprep.storage.work import scratch_beside
 
@@ -19,6 +19,9 @@ FORMAT = "slatprep-export"
 FORMAT_VERSION = 1
 INDEX = "index.json"
 """Name of the file that lists the contents of an exported folder."""
+
+HALF = "{} holds files of the old export, the new one, or both; run it again"
+"""The state of a folder, with other files in it, whose export ended midway."""
 
 
 @contextmanager
@@ -41,7 +44,10 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
         new.mkdir()
         yield new
         if out.exists() and (others := set(_names_below(out)) - own):
-            _replace_files(new, out, own, others)
+            try:
+                _replace_files(new, out, own, others)
+            except OSError as error:
+                raise StoreError(f"{error.strerror}: {HALF.format(out)}") from None
         else:
             replace_directory(new, out)
 
@@ -111,18 +117,18 @@ def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) 
             "file of this name; move it away, or export to a new path"
         )
     flush_tree(new)
+    own = own.intersection(_names_below(out))  # The index may contain any path.
     # If this is stopped, the next export knows the files of both.
     index = json.loads((new / INDEX).read_bytes())
     with staged(out / INDEX) as path:
-        path.write_bytes(orjson.dumps(index | {"files": sorted(own.union(names) - {INDEX})}))
+        path.write_text(json.dumps(index | {"files": sorted(own.union(names) - {INDEX})}))
     for name in names[:-1]:
         if name not in folders:
             (new / name).replace(out / name)
         elif name not in there:
             (out / name).unlink(missing_ok=True)
             (out / name).mkdir()
-    # Only names found below `out`: the index may contain any path. Files come before their folders.
-    for name in sorted(own.intersection(_names_below(out)).difference(names), reverse=True):
+    for name in sorted(own.difference(names), reverse=True):  # Files before their folders.
         if (out / name).is_dir():
             with suppress(OSError):  # Other files lie in it.
                 (out / name).rmdir()

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
 
-from slatprep.errors import ConfigError, StoreError, amount
+from slatprep.errors import ConfigError, SlatprepError, StoreError, amount
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
 from slatprep.learn.splits import select_assets
 from slatprep.readers.splits import Shares, Split
@@ -196,7 +196,9 @@ class SlatDataset(Dataset[Item]):
             raise IndexError(f"asset {draw.number} of {len(self)}")
         try:
             rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
-        except StoreError as error:
+        except SlatprepError as error:
+            if get_worker_info() is None:
+                raise
             # PyTorch hands on an error of a worker only if its class takes one text.
             raise StoreError(str(error)) from error
         asset_id = self.asset_ids[draw.number]

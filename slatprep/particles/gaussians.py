@@ -211,9 +211,11 @@ def write_picture(path: Path, frames: Sequence[NDArray[np.uint8]], rate: int) ->
         # GIF has hundredths of a second, and programs show no frame for less than two.
         tick, least = (10, 2) if form.lower() == "gif" else (1, 1)
         step = -(-least * tick * rate // 1000)
-        ends = [round(1000 / tick * number / rate) * tick for number in range(0, len(frames), step)]
-        shown = np.diff([*ends, round(1000 / tick * len(frames) / rate) * tick]).tolist()
-        pictures = [Image.fromarray(frame).quantize(64) for frame in frames[::step]]
+        # The last picture stands for all frames that are left, so that it is not too short.
+        numbers = [*range(0, max(len(frames) - step, 0) + 1, step)]
+        ends = [round(1000 / tick * at / rate) * tick for at in (*numbers, len(frames))]
+        shown = np.diff(ends).tolist()
+        pictures = [Image.fromarray(frames[number]).quantize(64) for number in numbers]
         pictures[0].save(
             new, form, save_all=True, append_images=pictures[1:], duration=shown, loop=0
         )

@@ -71,8 +71,8 @@ def prepare(
     size, notes = (len(positions) / count**3) / solid.mean(), []
     if len(positions) and abs(size - 1.0) > 0.02:
         notes.append(
-            f"the particles fill {size:.3g} times the object's volume, and weigh as much more; "
-            f"--particles {RESOLUTION} fills it exactly"
+            f"the particles fill {size:.3g} times the object's volume, and weigh {size:.3g} times "
+            f"as much; --particles {RESOLUTION} fills it exactly"
         )
     given = transfer(positions, field, far="nearest")
     classes, properties = given.material.copy(), given.properties.copy()
@@ -99,14 +99,14 @@ def particles_of(solid: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
 
     The solid (64, 64, 64) must fill at least half of a cube. The lattice has `count` to a side.
     """
-    voxels = np.arange(RESOLUTION, dtype=np.float32)
-    starts = voxels.dtype.type(RESOLUTION / count) * np.arange(count)[:, None]
-    ends = np.minimum(starts + RESOLUTION / count, voxels + 1)
-    part = np.maximum(ends - np.maximum(starts, voxels), 0) * count / RESOLUTION
+    # In parts of a voxel's edge, `count` to a voxel: whole numbers, which float32 holds exactly.
+    voxels, cubes = count * np.arange(RESOLUTION), RESOLUTION * np.arange(count)[:, None]
+    ends = np.minimum(cubes + RESOLUTION, voxels + count)
+    parts = np.maximum(ends - np.maximum(cubes, voxels), 0).astype(np.float32)
     shares = solid.astype(np.float32)
-    for _ in range(3):  # Each product turns the axes on.
-        shares = np.tensordot(shares, part.astype(np.float32), (0, 1))
-    return (np.argwhere(shares > 0.5 - 1e-6) + 0.5) / count - 0.5
+    for _ in range(3):  # Each product puts the first axis last.
+        shares = np.tensordot(shares, parts, (0, 1))
+    return (np.argwhere(2 * shares >= RESOLUTION**3) + 0.5) / count - 0.5
 
 
 def _read(

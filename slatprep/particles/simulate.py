@@ -32,7 +32,7 @@ _BOUNDS = (("E", "Pa", 1e-3, 1e15), ("density", "kg/m^3", 1e-3, 1e6), ("nu", "",
 _LENGTHS = 1e-6, 1e4
 """Smallest spacing and largest distance [m] that the engine takes."""
 
-MOST_WIND, MOST_FRAMES = 1e3, 10_000
+_MOST_WIND, _MOST_FRAMES = 1e3, 10_000
 """Largest speed of the wind [m/s], and number of frames."""
 
 
@@ -196,17 +196,19 @@ def _check_scene(
     frames: float,
 ) -> None:
     least, most = _LENGTHS
-    widest = max(height, float(np.ptp(positions, axis=0).max()))
-    if not (least <= spacing and 0 <= widest <= most):
+    lengths = {
+        "spacing": (spacing, least),
+        "object": (float(np.ptp(positions, axis=0).max()), 0.0),
+        "height": (height, 0.0),
+    }
+    for name, (length, smallest) in lengths.items():
+        if not smallest <= length <= most:
+            raise SlatprepError(f"{name}: {length:g} m; expected {smallest:g} to {most:g} m")
+    if not (np.abs(wind) <= _MOST_WIND).all():
+        raise SlatprepError(f"wind: {wind} m/s; expected at most {_MOST_WIND:g} m/s")
+    if not 0.5 < frames <= _MOST_FRAMES:
         raise SlatprepError(
-            f"particles {spacing:g} m apart, over {widest:g} m, cannot be simulated; expected at "
-            f"least {least:g} m, and at most {most:g} m"
-        )
-    if not (np.abs(wind) <= MOST_WIND).all():
-        raise SlatprepError(f"a wind of {wind} m/s is no wind; expected at most {MOST_WIND:g} m/s")
-    if not 1 <= round(frames) <= MOST_FRAMES:
-        raise SlatprepError(
-            f"seconds times rate is {frames:g}; expected 1 to {MOST_FRAMES:,} frames"
+            f"seconds times rate is {frames:g}; expected 1 to {_MOST_FRAMES:,} frames"
         )
 
 

@@ -89,7 +89,8 @@ def copied_version(place: RemotePlace) -> Path:
         )
     store = place.parent.parent
     folder = folder_for(store) / place.name
-    copy, sizes = folder / store.name, folder / f".{store.name}.sizes"
+    copy = folder / store.name
+    sizes = _sizes_of(copy)
     if _is_whole(copy, sizes):
         return copy
     try:
@@ -122,6 +123,11 @@ def copied_version(place: RemotePlace) -> Path:
     return copy
 
 
+def _sizes_of(copy: Path) -> Path:
+    """Return the file beside a copy that tells what the copy's files are."""
+    return copy.with_name(f".{copy.name}.sizes")
+
+
 def _is_whole(copy: Path, sizes: Path) -> bool:
     """Return whether a copy has all its files, by `_kept_of`."""
     try:
@@ -138,7 +144,7 @@ def _kept_of(file: Path) -> int | str:
 
 
 def what_to_do(store: str) -> str:
-    """Return advice for a damaged store, which may be a copy in the cache."""
-    if Path(store).is_relative_to(cache_folder()):
+    """Return advice for a damaged store, which may be a copy that `copied_version` made."""
+    if _sizes_of(Path(store)).exists():
         return f"Remove {store}, a copy, and open the store again"
     return "Copy the store again, or build it"

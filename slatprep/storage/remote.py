@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import errno
 import io
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
@@ -268,32 +268,33 @@ def pinned(place: RemotePlace) -> RemotePlace:
 
 def put_objects(folder: Path, place: RemotePlace, names: Iterable[str]) -> None:
     """Put small files of a folder below a place, under the same names, several at a time."""
-    with connected(place) as (system, root), ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
+    with connected(place) as (system, root):
 
         def put(name: str) -> None:
             system.put_file(str(folder / name), f"{root}/{name}", **multipart_options(system))
 
-        # If one fails, the others are not begun; fsspec's `put` would warn of each.
-        list(pool.map(put, names))
+        _for_each(system, put, names, _FILES_AT_ONCE)
 
 
 def get_objects(place: RemotePlace, folder: Path, names: Iterable[str]) -> None:
     """Get objects below a place into a folder, under the same names, a few at a time."""
-    with connected(place) as (system, root), ThreadPoolExecutor(_LARGE_AT_ONCE) as pool:
+    with connected(place) as (system, root):
 
         def get(name: str) -> None:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             system.get_file(f"{root}/{name}", str(folder / name), **multipart_options(system))
 
-        list(pool.map(get, names))
+        _for_each(system, get, names, _LARGE_AT_ONCE)
 
 
 def copy_objects(source: RemotePlace, target: RemotePlace, names: Iterable[str]) -> None:
     """Have the server copy objects below a place to another, under the same names."""
-    if names := list(names):
-        with connected(source) as (system, root), connected(target) as (_, other):
-            options = {"batch_size": _FILES_AT_ONCE} if system.async_impl else {}
-            system.copy([f"{root}/{n}" for n in names], [f"{other}/{n}" for n in names], **options)
+    with connected(source) as (system, root), connected(target) as (_, other):
+
+        def copy(name: str) -> None:
+            system.cp_file(f"{root}/{name}", f"{other}/{name}")
+
+        _for_each(system, copy, names, _FILES_AT_ONCE)
 
 
 def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
@@ -307,19 +308,30 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
                 system.rm_file(f"{root}/{name}")
 
         if "s3" not in system.protocol:
-            with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-                list(pool.map(remove, names))
+            _for_each(system, remove, names, _FILES_AT_ONCE)
             return
         keys = [{"Key": f"{above}/{name}".lstrip("/")} for name in names]
         for start in range(0, len(keys), _REMOVED_AT_ONCE):
             some = {"Objects": keys[start : start + _REMOVED_AT_ONCE], "Quiet": True}
             answer = system.call_s3("delete_objects", Bucket=bucket, Delete=some)
             for kept in answer.get("Errors", ()):
-                raise OSError(errno.EACCES, kept["Message"], kept["Key"])
+                number = errno.EACCES if kept.get("Code") == "AccessDenied" else errno.EIO
+                raise OSError(number, kept.get("Message") or kept.get("Code"), kept.get("Key"))
+
+
+def _for_each(system: Any, do: Callable[[str], None], names: Iterable[str], at_once: int) -> None:
+    """Call a function for each name, several at a time; after an error no other call begins."""
+    # Not by fsspec's calls for many files, which leave warnings behind if one of them fails. The
+    # hub makes a commit of each call, and commits of one branch exclude each other.
+    with ThreadPoolExecutor(at_once if "hf" not in system.protocol else 1) as pool:
+        list(pool.map(do, names))
 
 
 _FILES_AT_ONCE, _LARGE_AT_ONCE, _REMOVED_AT_ONCE = 16, 4, 1000
 """Numbers of small and of large files at a time, and of objects that S3 removes in a request."""
+
+_MISSING = (403, 404, 410)
+"""Answers for a missing file; public buckets deny what is not there."""
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 """Advice if S3 finds no credentials."""
@@ -363,7 +375,8 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
         yield system, str(name)
     except OSError as error:
         number, cause = error.errno or errno.EIO, error.__cause__
-        if place.protocol.startswith("http") and cause and getattr(cause, "status", 0) != 404:
+        missing = getattr(cause, "status", 0) in _MISSING
+        if place.protocol.startswith("http") and cause and not missing:
             # Its file system calls a file missing whatever went wrong.
             raise OSError(errno.EIO, _words(cause), str(place)) from error
         if isinstance(error, FileNotFoundError):

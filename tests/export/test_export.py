@@ -165,7 +165,7 @@ def test_what_lies_beside_an_export_stays(format, store, tmp_path):
     (out / "empty").mkdir()
     (out / "link").symlink_to(tmp_path)
     index = json.loads((out / "index.json").read_text())
-    index["assets"].append({"asset_id": "x", "file": "../outside.txt"})
+    index["assets"] += [{"asset_id": "x", "file": "../outside.txt"}, {"file": "\ud800"}]
     (out / "index.json").write_text(json.dumps(index))
     (tmp_path / "outside.txt").write_text("mine")
     before = tree(store)
@@ -240,9 +240,10 @@ def test_folders_of_an_export_come_and_go_beside_other_files(tmp_path):
     assert not any((tmp_path / "elsewhere").iterdir())
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(5, "Input/output error")])
 @pytest.mark.parametrize("moves", range(5))
 def test_an_export_stopped_beside_other_files_keeps_the_old_ones_and_is_made_again(
-    moves, tmp_path, monkeypatch
+    moves, error, tmp_path, monkeypatch
 ):
     out, move, left = tmp_path / "out", Path.replace, [moves]
     made(out, "a/x", "b", "c/y")
@@ -252,12 +253,13 @@ def test_an_export_stopped_beside_other_files_keeps_the_old_ones_and_is_made_aga
         if "export" in path.parts:
             left[0] -= 1
         if left[0] < 0:
-            raise KeyboardInterrupt
+            raise error
         return move(path, to)
 
     monkeypatch.setattr(Path, "replace", stopped)
     new = ("a/z", "b", "d/y", "e")
-    with pytest.raises(KeyboardInterrupt):
+    told = "" if isinstance(error, KeyboardInterrupt) else "files of the old export, the new one"
+    with pytest.raises((KeyboardInterrupt, StoreError), match=told or None):
         made(out, *new)
     monkeypatch.undo()
     old = {"a/x", "c/y"} if moves < len(new) else set()

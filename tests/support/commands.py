@@ -36,7 +36,7 @@ def python(*words: object, code: int = 0, **variables: str) -> "subprocess.Compl
     """Run Python, which ends with this exit code, with more variables in its environment."""
     done = subprocess.run(
         [sys.executable, *map(str, words)],
-        capture_output=True, text=True, check=False, env=os.environ | variables,
+        capture_output=True, text=True, check=False, env=os.environ | variables, timeout=600,
     )  # fmt: skip
     assert done.returncode == code, (words, done.stdout, done.stderr)
     return done

@@ -187,7 +187,9 @@ def below(names: list[str], version: str) -> set[str]:
 
 
 @pytest.mark.usefixtures("files_are_old", "few_are_new")
-def test_the_server_copies_shards_and_what_is_gone_is_new(s3, url, tmp_path, requests, monkeypatch):
+def test_the_server_copies_shards_and_what_is_gone_is_new(
+    s3, url, tmp_path, requests, monkeypatch, new_clients
+):
     dataset, beside = built(tmp_path, "a", "c", "e", "g")
     put(beside, url)  # As from another machine: nothing here knows of the sources' states.
     before = tree(beside)
@@ -196,8 +198,10 @@ def test_the_server_copies_shards_and_what_is_gone_is_new(s3, url, tmp_path, req
     inject(monkeypatch, lambda step, name: begun.append(name) if step == "asset begun" else None)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(S3FileSystem, "_cp_file", raising(PermissionError("Access Denied")))
+        new_clients()
         with pytest.raises(StoreError, match=r"cannot be written .*nothing was replaced"):
             build_store(dataset.parameters("pixie"), url)
+    new_clients()
     assert current(s3, url) == before
     old = open_store(url).path.name
     for noted in (requests.made, begun):

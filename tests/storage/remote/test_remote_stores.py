@@ -10,6 +10,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -249,6 +250,25 @@ def test_a_bucket_or_server_that_is_not_there_is_told(bucket, server, monkeypatc
             open_store(url)
 
 
+@pytest.mark.parametrize(("status", "number"), [
+    (403, errno.ENOENT), (404, errno.ENOENT), (410, errno.ENOENT), (500, errno.EIO),
+])  # fmt: skip
+def test_a_web_server_may_deny_what_is_not_there(status, number):
+    class Answer(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_error(status)
+
+        do_HEAD = do_GET  # noqa: N815
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Answer) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        place = place_of(f"http://127.0.0.1:{server.server_port}/x.zarr/current.json")
+        with pytest.raises(OSError) as caught:
+            place.read_bytes()
+        server.shutdown()
+    assert caught.value.errno == number
+
+
 @pytest.mark.parametrize("text", [
     b"", b"{", b"[]", b'{"format": "other"}', b"[" * 100_000,
     *(Pointer(*names, "", "").encode() for names in (("../../x", ""), ("0123456789abcdef", ".."))),
@@ -354,13 +374,24 @@ def test_a_command_names_the_url_that_was_given(url, undisturbed, tmp_path):
     assert f"is on no local disk; `slatprep subset {url}/versions/" in told
 
 
-def test_an_upload_that_fails_ends_in_one_error(url, undisturbed, change_client, recwarn):
+@pytest.mark.parametrize(("call", "said"), [
+    ("_put_file", "cannot be written to .*Access Denied"),
+    ("_get_file", r"cannot be copied to .*Access Denied"),
+])  # fmt: skip
+def test_a_transfer_that_fails_ends_in_one_error(
+    call, said, url, undisturbed, change_client, recwarn
+):
     async def denied(*given: Any, **options: Any) -> None:
         raise PermissionError("Access Denied")
 
-    change_client("_put_file", denied)
-    with pytest.raises(StoreError, match=r"cannot be written to .*Access Denied"):
+    if call == "_get_file":
         put(undisturbed[1], url)
+    change_client(call, denied)
+    with pytest.raises(StoreError, match=said):
+        if call == "_get_file":
+            open_store(url, copy=True)
+        else:
+            put(undisturbed[1], url)
     gc.collect()
     assert not [one for one in recwarn if "never awaited" in str(one.message)]
 
@@ -454,6 +485,9 @@ def test_a_damaged_shard_of_a_copy_says_what_to_remove(url, undisturbed, monkeyp
     (copy / "voxel/feats/c/0/0").write_bytes(shard)
     with pytest.raises(StoreError, match=f"damaged.* Remove {copy}, a copy, and open the store"):
         open_store(url, copy=True).read(0)
+    own = shutil.copytree(copy, copy.with_name("own.zarr"))  # No copy, though it lies in the cache.
+    with pytest.raises(StoreError, match="Copy the store again, or build it"):
+        open_store(own).read(0)
     shutil.rmtree(copy)
     assert_same(open_store(url, copy=True), open_store(undisturbed[1]))
 
