@@ -32,6 +32,7 @@ from slatprep.storage.files import (
 )
 from slatprep.storage.members import ArchivePlace
 from slatprep.storage.remote import (
+    NOT_ON_HUB,
     RemoteFile,
     RemoteFolder,
     RemotePlace,
@@ -280,7 +281,7 @@ class _ObjectStore(Storage):
     def absent(self) -> str:
         if self.place.protocol != "hf":
             return super().absent
-        return "is not on the hub, or not for everybody: check its name, and set HF_TOKEN"
+        return NOT_ON_HUB
 
     def names(self) -> tuple[list[str], list[str]]:
         found = list_folder(self.place)

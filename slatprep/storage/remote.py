@@ -249,10 +249,15 @@ def list_folder(place: RemotePlace) -> dict[str, dict[str, Any]]:
     return {key: entry for key, entry in entries.items() if _is_plain(key)}
 
 
+NOT_ON_HUB = "is not on the hub, or not for everybody: check its name, and set HF_TOKEN"
+"""Message on a dataset of the hub that `pinned` does not find."""
+
+
 def pinned(place: RemotePlace) -> RemotePlace:
     """Return a place of the hub at its current commit, so that nothing can replace it.
 
-    Other places have no commits, and are returned as they are.
+    Other places have no commits, and are returned as they are. FileNotFoundError if the hub has no
+    such dataset.
     """
     if place.protocol != "hf":
         return place
