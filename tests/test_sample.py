@@ -28,6 +28,10 @@ def test_values_come_from_the_nearest_voxel_and_end_at_the_limit():
         np.testing.assert_array_equal(found.properties[[0, 3]], values)
         assert np.isnan(found.properties[2]).all()
         assert found.properties.dtype == found.distance.dtype == np.float32
+    # The store has places as float32, and labels are those at these.
+    between = np.array([[15.5 / 64 - 0.5 + 1e-12, 10.5 / 64 - 0.5, 10.5 / 64 - 0.5]])
+    far = SampleParameters(method="nearest", max_distance=9.0)
+    assert sample(field, between, far).material.tolist() == [1]
 
 
 def test_a_vote_changes_the_class_and_takes_that_class_s_nearest_values():

@@ -5,7 +5,9 @@ import itertools
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -67,6 +69,11 @@ def test_filters(learn_store):
         learn.Shares(0.5, 0.1, 0.1)
     with pytest.raises(ConfigError, match="no asset"):
         learn.SlatDataset(store, "train", shares=learn.Shares(0.0, 0.0, 1.0))
+
+
+def test_an_asset_without_a_label_is_never_chosen(learn_copy):
+    rewrite(learn_copy, "asset/valid_share", 0, 0.0)
+    assert select_assets(open_store(learn_copy)).tolist() == list(range(1, 9))
 
 
 def test_failed_assets_are_left_out_unless_all_are_asked_for(learn_copy):
@@ -206,6 +213,15 @@ def test_augmentation_moves_coordinates_and_nothing_else(learn_store):
         a, b = (item.coords[::7].double() for item in (plain[k], turned[k]))
         assert torch.equal(torch.cdist(a, a).round(decimals=6), torch.cdist(b, b).round(decimals=6))
     assert moved > len(plain) // 2
+
+
+def test_latents_of_another_grid_are_moved_about_its_own_middle(learn_store, monkeypatch):
+    given = Mock(side_effect=lambda coords, *_: coords)
+    monkeypatch.setattr("slatprep.learn.dataset.move", given)
+    dataset = learn.SlatDataset(learn_store, augmentation="all")
+    monkeypatch.setattr(dataset, "_latents", replace(dataset._latents, resolution=32))
+    assert len(dataset[0].coords)
+    assert given.call_args.args[2:] == (32,)
 
 
 @given(st.sets(st.text(min_size=1), min_size=1, max_size=12))

@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -23,7 +24,7 @@ from slatprep.learn import train as module
 from slatprep.learn.dataset import IGNORED, SlatDataset, SlatLoader, SparseBatch, collate
 from slatprep.learn.decoder import Prediction, make_decoder
 from slatprep.learn.metrics import fit_baselines
-from slatprep.learn.runs import BEST, LAST, Run, open_run
+from slatprep.learn.runs import BEST, LAST, EpochRecord, Run, open_run
 from slatprep.learn.train import TrainParameters, loss_of, precision_of, train
 from slatprep.readers.splits import Assignment, Shares, split_of
 from slatprep.storage.atomic import take_lock
@@ -180,7 +181,45 @@ def test_wrong_runs_are_named(learn_store, tmp_path):
         train(learn_store, tmp_path, one)
 
 
-def test_accumulation_is_the_gradient_of_the_mean(learn_store, tmp_path):
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, list[torch.Tensor]]]:
+    """Note the rate and the gradients of each step of AdamW."""
+    noted: list[tuple[float, list[torch.Tensor]]] = []
+
+    class Noting(torch.optim.AdamW):
+        def step(self, *given: Any) -> Any:
+            (group,) = self.param_groups
+            noted.append((group["lr"], [one.grad.clone() for one in group["params"]]))
+            return super().step(*given)
+
+    monkeypatch.setattr(torch.optim, "AdamW", Noting)
+    return noted
+
+
+def test_the_rate_falls_as_a_cosine_over_all_epochs(learn_store, tmp_path, steps):
+    train(learn_store, tmp_path / "run", dataclasses.replace(SHORT, epochs=2, accumulate=3))
+    rates = [rate for rate, _ in steps]
+    assert len(rates) == 4
+    assert rates == pytest.approx([1e-3 * (1 + math.cos(math.pi * k / 4)) for k in range(4)])
+
+
+def test_seed_and_choice_reach_the_dataset(learn_store, tmp_path, monkeypatch):
+    made = Mock(side_effect=SlatDataset)
+    monkeypatch.setattr(module, "SlatDataset", made)
+    given = dataclasses.replace(SHORT, epochs=1, seed=7, max_ambiguity=0.9)
+    train(learn_store, tmp_path / "run", given)
+    told = [call.kwargs for call in made.call_args_list]
+    assert len(told) == 3
+    assert {(each["seed"], each["max_ambiguity"]) for each in told} == {(7, 0.9)}
+
+
+def test_the_best_epoch_is_that_of_the_least_loss():
+    epochs = [EpochRecord(0, 1, 1, 2.0, 0.1, 0.5), EpochRecord(1, 1, 1, 1.0, 0.2, 0.5)]
+    session = Mock(parameters=SHORT, history=epochs, epoch=2)
+    assert module._Session.best_epoch.fget(session) == 1
+
+
+def test_accumulation_is_the_gradient_of_the_mean(learn_store, tmp_path, steps):
     # Equal batches by equal weights: all objects in one step, one at a time, in any order.
     base = dataclasses.replace(SHORT, epochs=1, accumulate=100, augmentation="none")
     plain = train(learn_store, tmp_path / "run", base).history[0].train_loss
@@ -192,6 +231,9 @@ def test_accumulation_is_the_gradient_of_the_mean(learn_store, tmp_path):
     batches = [collate([dataset[k]]) for k in range(len(dataset))]
     losses = [loss_of(model(batch.coords, batch.feats), batch) for batch in batches]
     torch.stack(losses).mean().backward()
+    # Adam's first step is the same for any multiple of the gradient.
+    for parameter, gradient in zip(model.parameters(), steps[0][1], strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-6)
     optimizer.step()
     for name, parameter in model.named_parameters():
         torch.testing.assert_close(moved[name], parameter.detach(), rtol=0, atol=2e-4)

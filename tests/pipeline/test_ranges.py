@@ -10,6 +10,9 @@ from support.trees import tree
 
 from slatprep import PROPERTY_COLUMNS, ConfigError, InputError, build_store, open_store
 from slatprep.inspect.verify import verify_store
+from slatprep.parameters import NormalizeParameters
+from slatprep.pipeline.rows import Row
+from slatprep.pipeline.settle import _chosen
 from slatprep.store.record import BuildRecord
 from slatprep.store.record_json import read_record
 
@@ -105,6 +108,13 @@ def test_files_that_moved_leave_the_store_as_it_is(make_dataset, tmp_path):
         assert builds[0] == builds[1]
         build = open_store(out).attributes["build"]
         assert name in str(build) and str(tmp_path) not in str(build)
+
+
+def test_objects_without_labels_take_no_part_in_the_split():
+    columns = [{"object_id": one, "category": "", "n_valid": n} for one, n in (("a", 5), ("b", 0))]
+    rows = [Row(each["object_id"], 5, columns=each) for each in columns]
+    with pytest.raises(ConfigError, match="no object is trained on"):
+        _chosen(rows, NormalizeParameters(objects="train", split_by="pixie"))
 
 
 def test_by_hash_the_training_s_own_objects_count(make_dataset, tmp_path):
