@@ -181,3 +181,11 @@ def test_what_is_no_definition_is_named(folder):
     assert "binary.toml" in message_of(folder / "binary.toml")
     message = message_of(write(folder, MINIMAL), preset="papr")
     assert "papr" in message and "paper" in message
+
+
+def test_a_fault_of_several_tables_is_told_without_the_document(tmp_path):
+    file = tmp_path / "d.toml"
+    file.write_text('[pixieverse]\nroot = "p"\nsamples = "merge"\n[slat]\nroot = "s"\n')
+    told = rf"^{file}: expected pixieverse\.samples of one, first or all with --consensus"
+    with pytest.raises(ConfigError, match=told):
+        load_parameters(file, {"consensus": {"settle": True}})

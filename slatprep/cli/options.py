@@ -190,7 +190,7 @@ def complete_asset(
     return []
 
 
-_NAMED = "by its id, a beginning of it, or the number of its row, from 0"
+_NAMED = "by its id, a beginning of it, or else the number of its row, from 0"
 _ASKED = Click("--asset", metavar="ID", shell_complete=complete_asset)
 AssetIds = Annotated[tuple[str, ...], f"An asset, {_NAMED}; may be repeated.", _ASKED]
 AssetsOrAll = Annotated[

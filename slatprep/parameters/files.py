@@ -243,7 +243,8 @@ def _explain(error: ErrorDetails, origin: _Origin) -> str:
         group, _, key = name.rpartition(".")
         return f"{where}: {name}: not given; {how}set `{key}` in the table [{group}]"
     expected = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    return f"{where}: {name}: got {error['input']!r}; expected {expected}"
+    got = f" {name}: got {error['input']!r};" if name else ""  # Else it is of several tables.
+    return f"{where}:{got} expected {expected}"
 
 
 def _keys_of(groups: tuple[str, ...]) -> list[str]:

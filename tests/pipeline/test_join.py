@@ -135,6 +135,26 @@ def test_stores_with_ranges_of_their_own_get_those_of_all(tmp_path):
             concat_stores([tmp_path / "a.zarr", lost], tmp_path / "all.zarr")
 
 
+def test_what_ties_change_is_told_in_the_ranges_of_all(tmp_path):
+    """A cube of two halves, whose turns give other properties."""
+    grid = np.full((64, 64, 64, 4), (0, 0, 0, 7), np.float32)
+    grid[24:40, 24:40, 24:40] = 1e3, 1e6, 0.3, 0
+    grid[24:32, 24:40, 24:40] = 8e3, 2e11, 0.28, 1
+    coords = np.argwhere(grid[..., 3] < 7).astype(np.uint8)
+    feats = np.random.default_rng(0).normal(0.0, 3.0, (len(coords), 8)).astype(np.float32)
+    for name, ids in (("a", "a"), ("b", "b"), ("all", "ab")):
+        dataset = Dataset(tmp_path / name).having(*ids)
+        if "a" in ids:
+            dataset.write_grid("a", grid)
+            dataset.write_slat("a.npz", coords, feats)
+        build_store(dataset.parameters(), tmp_path / f"{name}.zarr")
+    concat_stores([tmp_path / "a.zarr", tmp_path / "b.zarr"], tmp_path / "joined.zarr")
+    stores = [open_store(tmp_path / f"{name}.zarr") for name in ("a", "all", "joined")]
+    alone, built, joined = (store.column("property_ambiguity")[0] for store in stores)
+    np.testing.assert_array_equal(joined, built)
+    assert (built > 0).any() and not np.array_equal(alone, built)
+
+
 def test_one_value_of_a_store_is_a_point_in_the_ranges_of_all(tmp_path):
     grids = make_asset(0).grid, make_asset(1).grid
     for grid, most in zip(grids, (0.3, 0.34), strict=True):
