@@ -161,7 +161,7 @@ class LazyGroup(click.Group):
 \b
 Example:
   slatprep make-demo demo --assets 12 --seed 0
-  slatprep build-store --pixieverse demo/pixieverse --slat demo/slat --out demo.zarr
+  slatprep build-store --config demo/dataset.toml --out demo.zarr
 """,
 )
 @click.version_option(package_name="slatprep", prog_name="slatprep")

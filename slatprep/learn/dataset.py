@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
 
-from slatprep.errors import ConfigError, SlatprepError, StoreError, amount
+from slatprep.errors import ConfigError, StoreError, amount
 from slatprep.learn.augment import Augmentation, lattice_symmetries, move
 from slatprep.learn.splits import select_assets
 from slatprep.readers.splits import Shares, Split
@@ -196,7 +196,7 @@ class SlatDataset(Dataset[Item]):
             raise IndexError(f"asset {draw.number} of {len(self)}")
         try:
             rows = self.store.read(int(self.indices[draw.number]), _COLUMNS)
-        except SlatprepError as error:
+        except StoreError as error:
             if get_worker_info() is None:
                 raise
             # PyTorch hands on an error of a worker only if its class takes one text.

@@ -206,7 +206,7 @@ def _check_scene(
             raise SlatprepError(f"{name}: {length:g} m; expected {smallest:g} to {most:g} m")
     if not (np.abs(wind) <= _MOST_WIND).all():
         raise SlatprepError(f"wind: {wind} m/s; expected at most {_MOST_WIND:g} m/s")
-    if not 0.5 < frames <= _MOST_FRAMES:
+    if not 0.5 < frames < _MOST_FRAMES + 0.5:
         raise SlatprepError(
             f"seconds times rate is {frames:g}; expected 1 to {_MOST_FRAMES:,} frames"
         )

@@ -20,11 +20,14 @@ from slatprep.pipeline.rows import NextStore, Row, SourceStore, column, in_order
 from slatprep.pipeline.spool import Spool
 from slatprep.readers.contents import resolve_latents
 from slatprep.readers.splits import Shares, assign_splits
-from slatprep.records import AssetPair, Contents, Normalization
+from slatprep.records import AssetPair, Contents, LatentSpace, Normalization
 from slatprep.store.record import FailedRecord
 from slatprep.workers.local import Jobs, run_unordered
 
 _SIGN = np.uint32(1 << 31)
+
+_TOLD = 5
+"""Number of assets that are named where no record names them."""
 
 _HALF = 16
 """Number of bits of a value that are counted at a time."""
@@ -55,7 +58,13 @@ def settle_rows(
             rows = apply_passes(rows, context, crew, declared.n_labels)
         ranges = dataset_ranges(rows, context.spool, wanted, crew.of(len(rows)))
     rows = in_order(rows, before.previous, wanted.compact)
-    contents = resolved_contents(rows, stores, declared, parameters.slat.standardised)
+    known = before.previous.contents.latents if before.previous is not None else None
+    try:
+        contents = resolved_contents(rows, stores, declared, parameters.slat.standardised, known)
+    except ConfigError:
+        for asset in failed[:_TOLD]:  # No store and no record will tell of them.
+            crew.tell(f"{asset.asset_id}: {asset.reason}")
+        raise
     how = (wanted.build, parameters.store, bool(stores))
     return NextStore(rows, stores, ranges, contents, *how), failed
 
@@ -102,7 +111,11 @@ def kept_rows(
 
 
 def resolved_contents(
-    rows: Sequence[Row], stores: Sequence[SourceStore], declared: Contents, standardised: str
+    rows: Sequence[Row],
+    stores: Sequence[SourceStore],
+    declared: Contents,
+    standardised: str,
+    before: LatentSpace | None = None,
 ) -> Contents:
     """Return the contents of a store, with the latent space that `resolve_latents` finds."""
     # Sums of the same numbers in another order differ in their last digits.
@@ -110,7 +123,8 @@ def resolved_contents(
     # Annotations of one object share its SLAT, which counts once.
     counts = (row.n_voxels for row in rows)
     moments = list(dict.fromkeys(zip(counts, moments_of(rows, stores), strict=True)))
-    return replace(declared, latents=resolve_latents(declared.latents, standardised, moments))
+    latents = resolve_latents(declared.latents, standardised, moments, before)
+    return replace(declared, latents=latents)
 
 
 def check_objects(pairs: Sequence[AssetPair], parameters: NormalizeParameters) -> None:

@@ -119,25 +119,31 @@ def _read_space(path: Place) -> LatentSpace:
 
 
 def resolve_latents(
-    declared: LatentSpace, standardised: str, moments: Sequence[tuple[int, LatentMoments | None]]
+    declared: LatentSpace,
+    standardised: str,
+    moments: Sequence[tuple[int, LatentMoments | None]],
+    before: LatentSpace | None = None,
 ) -> LatentSpace:
     """Return the space of a dataset's latents after all assets have been read.
 
     `moments` holds the voxel count and moments of each SLAT, in the order of the assets' ids. If
-    `standardised` is ``auto``, they decide whether latents are standardised.
+    `standardised` is ``auto``, they decide whether latents are standardised. `before` is the space
+    of the store that is updated, which decides if a single SLAT cannot.
     """
     known = [(count, one) for count, one in moments if one is not None and count]
     if not known:
         return declared
     pooled = pooled_moments(known)
     auto = standardised == "auto" and sum(count for count, _ in known) >= ENOUGH
-    if auto and len(known) == 1 and not tell_alone(pooled, declared):
+    alone = auto and len(known) == 1 and not tell_alone(pooled, declared)
+    if alone and before is None:
         raise ConfigError(
             "one SLAT alone does not tell whether its latents have been standardised "
             f'({in_words(pooled)}). Say standardised = "yes" or "no" in [slat] of a --config FILE'
         )
     if auto:
-        declared = replace(declared, standardised=look_standardised(pooled, declared))
+        look = before.standardised if alone and before else look_standardised(pooled, declared)
+        declared = replace(declared, standardised=look)
     if not declared.mean and not declared.standardised:
         # A constant channel keeps its scale.
         std = tuple(s if s > 0 else 1.0 for s in pooled.std)

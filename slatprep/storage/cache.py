@@ -76,18 +76,18 @@ def short(text: str) -> str:
 
 
 def copied_version(place: RemotePlace) -> Path:
-    """Return the local copy of a store's version or commit, after making it if needed.
+    """Return the local copy of a store's version, after making it if needed.
 
     Versions never change, so a copy is made once, or again if somebody removed, cut or changed
     its files; bits that flip in large files are found when they are read.
     StoreError if the place is no version, differs from its pointer, or cannot be copied.
     """
-    store = place.parent.parent if is_version(place) else place
-    if store is place and place.protocol != "hf":
+    if not is_version(place):
         raise StoreError(
             f"{place}: lies there without versions, so a copy could not be told to be current; "
             "build it there with `slatprep build-store`, or copy it yourself"
         )
+    store = place.parent.parent
     folder = folder_for(store) / place.name
     copy = folder / store.name
     sizes = _sizes_of(copy)

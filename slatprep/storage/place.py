@@ -32,7 +32,6 @@ from slatprep.storage.files import (
 )
 from slatprep.storage.members import ArchivePlace
 from slatprep.storage.remote import (
-    NOT_ON_HUB,
     RemoteFile,
     RemoteFolder,
     RemotePlace,
@@ -281,7 +280,7 @@ class _ObjectStore(Storage):
     def absent(self) -> str:
         if self.place.protocol != "hf":
             return super().absent
-        return NOT_ON_HUB
+        return "is not on the hub, or not for everybody: check its name, and set HF_TOKEN"
 
     def names(self) -> tuple[list[str], list[str]]:
         found = list_folder(self.place)
@@ -294,7 +293,7 @@ class _ObjectStore(Storage):
         return [Archive.of_object(place / name, found[name], wanted) for name in names]
 
     def folder(self) -> Folder:
-        return RemoteFolder(self.place)
+        return RemoteFolder(pinned(self.place))  # A commit may replace a store while it is read.
 
     def locate(self, file: Place) -> tuple[Place, str]:
         # An object store has no links that could lead out.

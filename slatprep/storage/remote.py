@@ -249,15 +249,10 @@ def list_folder(place: RemotePlace) -> dict[str, dict[str, Any]]:
     return {key: entry for key, entry in entries.items() if _is_plain(key)}
 
 
-NOT_ON_HUB = "is not on the hub, or not for everybody: check its name, and set HF_TOKEN"
-"""Message on a dataset of the hub that `pinned` does not find."""
-
-
 def pinned(place: RemotePlace) -> RemotePlace:
     """Return a place of the hub at its current commit, so that nothing can replace it.
 
-    Other places have no commits, and are returned as they are. FileNotFoundError if the hub has no
-    such dataset.
+    Other places have no commits, and are returned as they are.
     """
     if place.protocol != "hf":
         return place
@@ -265,6 +260,8 @@ def pinned(place: RemotePlace) -> RemotePlace:
         from huggingface_hub import HfApi
 
         at = system.resolve_path(name)
+        if not hasattr(at, "repo_id"):
+            return place  # A bucket has no commits.
         api = HfApi(endpoint=system.endpoint, token=system.token)
         sha = api.repo_info(at.repo_id, repo_type=at.repo_type, revision=at.revision).sha
         base = f"{at.repo_type}s/{at.repo_id}@{sha}"
@@ -325,7 +322,7 @@ def remove_objects(place: RemotePlace, names: Iterable[str]) -> None:
 
 
 def _for_each(system: Any, do: Callable[[str], None], names: Iterable[str], at_once: int) -> None:
-    """Call a function for each name, several at a time; after an error no other call begins."""
+    """Call a function for each name, several at a time, and raise the first error."""
     # Not by fsspec's calls for many files, which leave warnings behind if one of them fails. The
     # hub makes a commit of each call, and commits of one branch exclude each other.
     with ThreadPoolExecutor(at_once if "hf" not in system.protocol else 1) as pool:
@@ -334,9 +331,6 @@ def _for_each(system: Any, do: Callable[[str], None], names: Iterable[str], at_o
 
 _FILES_AT_ONCE, _LARGE_AT_ONCE, _REMOVED_AT_ONCE = 16, 4, 1000
 """Numbers of small and of large files at a time, and of objects that S3 removes in a request."""
-
-_MISSING = (403, 404, 410)
-"""Answers for a missing file; public buckets deny what is not there."""
 
 _CREDENTIALS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
 """Advice if S3 finds no credentials."""
@@ -380,10 +374,11 @@ def connected(place: RemotePlace, *, fresh: bool = True) -> Iterator[tuple[Any, 
         yield system, str(name)
     except OSError as error:
         number, cause = error.errno or errno.EIO, error.__cause__
-        missing = getattr(cause, "status", 0) in _MISSING
-        if place.protocol.startswith("http") and cause and not missing:
+        status = getattr(cause, "status", 0)
+        if place.protocol.startswith("http") and cause and status not in (404, 410):
             # Its file system calls a file missing whatever went wrong.
-            raise OSError(errno.EIO, _words(cause), str(place)) from error
+            number = errno.EACCES if status == 403 else errno.EIO
+            raise OSError(number, _words(cause), str(place)) from error
         if isinstance(error, FileNotFoundError):
             number = errno.ENOENT
         elif isinstance(error, PermissionError):

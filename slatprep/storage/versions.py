@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from slatprep.errors import StoreError
-from slatprep.storage.remote import NOT_ON_HUB, RemotePlace, pinned
+from slatprep.storage.remote import RemotePlace
 
 if TYPE_CHECKING:
     from slatprep.records import Place
@@ -87,6 +87,10 @@ def read_pointer(store: RemotePlace) -> Pointer | None:
             data = file.read(_MAX_POINTER_BYTES)
     except FileNotFoundError:
         return None
+    except PermissionError:
+        if not store.protocol.startswith("http"):
+            raise
+        return None  # Public buckets deny what is not there.
     try:
         return Pointer.decode(data)
     except (ValueError, RecursionError) as error:
@@ -105,16 +109,13 @@ def content_of(digests: Mapping[str, str]) -> str:
 def current_version(store: RemotePlace) -> RemotePlace:
     """Return the place of a store's files: its current version, or the place itself.
 
-    The place may be a store, one of its versions, or a plain copy of a store. On the hub it is
-    that of the current commit. StoreError if the pointer cannot be reached or read.
+    The place may be a store, one of its versions, or a plain copy of a store. StoreError if the
+    pointer cannot be reached or read.
     """
+    if is_version(store):
+        return store
     try:
-        store = pinned(store)
-        if is_version(store):
-            return store
         pointer = read_pointer(store)
-    except FileNotFoundError:
-        raise StoreError(f"{store} {NOT_ON_HUB}") from None
     except OSError as error:
         raise StoreError(f"{store}: cannot be reached ({error.strerror})") from None
     return store / VERSIONS / pointer.version if pointer else store

@@ -152,6 +152,8 @@ def metadata_findings(path: Place) -> Iterator[Finding]:
             continue
         try:
             arrays[name] = read_metadata(path / where)
+        except UnreachableError:
+            raise
         except StoreError as error:
             yield Finding(where, "", str(error), "readable metadata")
             continue
@@ -188,6 +190,8 @@ def file_findings(store: Store, jobs: Jobs, below: str = "") -> tuple[int, set[F
     """
     try:
         expected = digests_in(store)
+    except UnreachableError:
+        raise
     except StoreError as error:
         return 0, {Finding("file", "", str(error), "a digest of every file")}
     findings = set()

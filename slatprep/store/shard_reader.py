@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import SlatprepError, StoreError
+from slatprep.errors import StoreError
 from slatprep.parameters import MAX_SHARD_CHUNKS
 from slatprep.records import MAX_NAME_BYTES
 from slatprep.storage.cache import what_to_do
@@ -66,11 +66,8 @@ class DamagedFileError(StoreError):
         return (type(self), (self.folder, self.file, self.fault, self.expected))
 
 
-class UnreachableError(SlatprepError):
-    """A file of a store that an object store does not give.
-
-    It is no StoreError, as the store may be whole.
-    """
+class UnreachableError(StoreError):
+    """A file of a store that an object store does not give; the `file` itself may be whole."""
 
     def __init__(self, folder: object, file: str, fault: str) -> None:
         super().__init__(
@@ -271,7 +268,7 @@ class RowReader:
             raise self._damaged(number, "its index leads out of it")
         return index
 
-    def _unread(self, number: int, error: OSError) -> SlatprepError:
+    def _unread(self, number: int, error: OSError) -> StoreError:
         """Return the error for a file that cannot be opened or read."""
         file, fault = self.key(number), error.strerror or str(error)
         if isinstance(error, FileNotFoundError):

@@ -197,7 +197,7 @@ def test_a_store_is_read_from_the_hub(hub, mixed_build, tmp_path):
     for asset, digest in zip(store, sums, strict=True):
         content = asset.properties.tobytes() + asset.grid_material.tobytes()
         assert hashlib.sha256(content).hexdigest() == digest
-    assert "is not a slatprep store" in faults[0] and "is not on the hub, or not" in faults[1]
+    assert len(faults) == 2 and all("is not a slatprep store" in fault for fault in faults)
 
 
 def test_a_store_of_the_hub_stays_at_the_commit_that_was_opened(root, mixed_build, tmp_path):
@@ -207,18 +207,15 @@ def test_a_store_of_the_hub_stays_at_the_commit_that_was_opened(root, mixed_buil
         f"import json, os, pathlib, sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "from support.published_hub import PublishedHub\n"
         f"hub, (first, last) = PublishedHub(), map(pathlib.Path, {folders!r})\n"
-        "commit, os.environ['HF_ENDPOINT'] = hub.publish('me/store', first), hub.address\n"
+        "hub.publish('me/store', first)\n"
+        "os.environ['HF_ENDPOINT'] = hub.address\n"
         "import slatprep\n"
         "opened = slatprep.open_store('hf://datasets/me/store/mixed.zarr')\n"
         "hub.publish('me/store', last)\n"
-        "url = f'hf://datasets/me/store@{commit}/mixed.zarr'\n"
-        "stores = opened, slatprep.open_store(url, copy=True)\n"
-        "sums = [[float(one.feats.sum()) for one in store] for store in stores]\n"
-        "print(json.dumps([*sums, str(stores[1].path)]))\n"
+        "print(json.dumps([float(one.feats.sum()) for one in opened]))\n"
     )
-    *sums, path = from_hub("", code, tmp_path)
-    assert sums == [[float(one.feats.sum()) for one in open_store(mixed_build.store)]] * 2
-    assert tree(Path(path)) == tree(Path(str(mixed_build.store)))
+    sums = from_hub("", code, tmp_path)
+    assert sums == [float(one.feats.sum()) for one in open_store(mixed_build.store)]
 
 
 def test_shards_are_a_dataset_of_the_hubs_library(root, mixed_build, tmp_path, monkeypatch):

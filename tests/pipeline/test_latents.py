@@ -11,7 +11,7 @@ from support.synthetic import Dataset
 from support.trees import records_beside, records_of, tree
 
 from slatprep import build_store, concat_stores, export_store, open_store
-from slatprep.errors import InputError, StoreError
+from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.inspect.verify import verify_store
 from slatprep.learn.dataset import SlatDataset
 from slatprep.learn.predict import load_checkpoint, predict
@@ -85,6 +85,21 @@ def test_warnings_follow_what_is_said_of_latents_later(dataset, tmp_path):
         for out in (updated, fresh):
             build_store(dataset.parameters(slat=slat), out)
         assert tree(updated) == tree(fresh), slat
+
+
+def test_one_slat_that_cannot_tell_is_asked_about_and_an_update_takes_the_store_s(tmp_path):
+    made, out, told = Dataset(tmp_path / "d").having("a", "b"), tmp_path / "s.zarr", list[str]()
+    for number, (name, asset) in enumerate(made.assets.items()):
+        feats = np.random.default_rng(number).normal(3.0, 1.0, asset.feats.shape)
+        made.write_slat(f"{name}.npz", asset.coords, feats.astype(np.float32))
+    build_store(made.parameters("pixie"), out)
+    assert not open_store(out).contents.latents.standardised
+    made.write_grid("b", np.zeros((2, 2, 2, 4), np.float32))
+    build_store(made.parameters("pixie"), out)
+    assert open_store(out).ids == ["a"] and not open_store(out).contents.latents.standardised
+    with pytest.raises(ConfigError, match="one SLAT alone does not tell"):
+        build_store(made.parameters("pixie"), tmp_path / "new.zarr", note=told.append)
+    assert sum(line.startswith("b: ") for line in told) == 1
 
 
 def test_assets_too_small_to_tell_alone_tell_together(dataset, tmp_path):

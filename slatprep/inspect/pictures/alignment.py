@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.align.consensus import NEAR_DEGREES, degrees_between
+from slatprep.align.consensus import degrees_between
 from slatprep.align.starts import euler_starts
 from slatprep.geometry.frames import split_transform
 from slatprep.inspect.check import AlignmentCheck
@@ -293,7 +293,7 @@ def _candidates(figure: Figure, alignment: Alignment, left: float, y: float) -> 
     words = f"{len(own)} distinct of {len(candidates)}, by coarse fitness"
     axes = _plot(figure, left, y, heading, words)
     wide = alignment.search is Search.SO3
-    taken = None if wide else _start_taken(alignment, own)
+    taken = None if wide else _nearest_start(alignment, own)
     colours = [canvas.ACCENT if k == taken else canvas.RULE for k in range(len(own))]
     axes.bar(range(len(own)), [c.fitness for c in own], width=0.78, color=colours)
     axes.set_xlim(-0.8, max(len(own), 2) - 0.2)
@@ -305,17 +305,17 @@ def _candidates(figure: Figure, alignment: Alignment, left: float, y: float) -> 
         axes.set_xticks([-0.4], [name], ha="left")
     elif taken is not None:
         angles = own[taken].euler_degrees or ()
-        name = "start at " + ", ".join(f"{angle:g}°" for angle in angles)
+        name = "nearest start: " + ", ".join(f"{angle:g}°" for angle in angles)
         axes.set_xticks([taken], [name], ha="left" if taken < len(own) / 2 else "right")
     else:
         axes.set_xticks([])
 
 
-def _start_taken(alignment: Alignment, starts: Sequence[Candidate]) -> int | None:
-    """Return which start has the alignment's rotation, about; it need not be that which fits best.
+def _nearest_start(alignment: Alignment, starts: Sequence[Candidate]) -> int | None:
+    """Return which start is nearest to the alignment's rotation; it need not fit best.
 
-    Other placements may fit about as well, and consensus or latents may choose one. None if no
-    start has the rotation.
+    Other placements may fit about as well, and consensus or latents may choose one. None if the
+    starts have no angles.
     """
     rotation = split_transform(alignment.transform)[0]
     named = {one.index: one.rotation for one in euler_starts()}
@@ -324,7 +324,7 @@ def _start_taken(alignment: Alignment, starts: Sequence[Candidate]) -> int | Non
         for one in starts
     ]
     nearest = int(np.argmin(apart))
-    return nearest if apart[nearest] <= NEAR_DEGREES else None
+    return nearest if math.isfinite(apart[nearest]) else None
 
 
 def _heading(figure: Figure, left: float, y: float, heading: str, words: str) -> None:

@@ -28,6 +28,7 @@ from slatprep.store.contract import MAX_VOXELS, Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
 from slatprep.store.reader import Store, open_store
 from slatprep.store.records import found_manifests
+from slatprep.store.shard_reader import UnreachableError
 from slatprep.workers import Progress, counted
 from slatprep.workers.local import Jobs, require_shared, run_unordered
 
@@ -161,6 +162,8 @@ def verify_store(
     try:
         findings |= set(index_findings(store))
         rows = _chosen(len(store), sample)
+    except UnreachableError:
+        raise
     except StoreError as error:
         findings.add(Finding("asset", "", str(error), "readable ids and offsets"))
         rows = []

@@ -41,7 +41,7 @@ from slatprep.store.layout import RECORD_ARRAY
 from slatprep.store.reader import StoredAsset
 from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import RecordError, columns_of, digest_of
-from slatprep.store.shard_reader import DamagedFileError
+from slatprep.store.shard_reader import DamagedFileError, UnreachableError
 
 CONFIDENCE_TOLERANCE = 1e-5
 """Largest allowed difference of probabilities, shares and normalised spreads: machines may
@@ -72,6 +72,8 @@ def asset_findings(
             findings += changed
             if record.merged and sound and not changed:
                 findings += merged_findings(asset, record, roots)
+    except UnreachableError:
+        raise
     except DamagedFileError as error:
         findings.append(Finding(error.file, asset_id, error.fault, error.expected))
     except RecordError as error:

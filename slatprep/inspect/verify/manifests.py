@@ -22,6 +22,7 @@ from slatprep.store.reader import Store
 from slatprep.store.record import BuildRecord
 from slatprep.store.record_json import RecordError, read_record
 from slatprep.store.records import BUILD, build_in, build_text, file_names, lines_of
+from slatprep.store.shard_reader import UnreachableError
 
 _MOST_LINES = 8
 
@@ -110,6 +111,8 @@ def manifest_findings(
             return
         try:
             claims = [claim for claim in _claims(build, store) if claim[1] != claim[2]]
+        except UnreachableError:
+            raise
         except StoreError:
             claims = []  # A column is damaged; a finding on its file reports it.
         for name, said, held in claims:
@@ -139,6 +142,8 @@ def _line_findings(store: Store, file: Place, shard: int) -> Iterator[Finding]:
     try:
         expected = lines_of(store, shard)
         found = storage_of(file).read(len(expected))
+    except UnreachableError:
+        raise
     except StoreError:
         return  # The shard of records is damaged; a finding on its file reports it.
     except OSError as error:

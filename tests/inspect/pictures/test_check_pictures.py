@@ -15,6 +15,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from support import commands
 from support.deformed import MOVES
 from support.made_store import rewrite
@@ -134,18 +135,22 @@ def test_the_next_of_tied_placements_stands_beside_the_chosen_one(copy):
 
 
 @pytest.mark.usefixtures("sides")
-def test_the_start_that_was_taken_is_marked_though_another_fits_better(copy):
+@pytest.mark.parametrize("tilt", [0, 40])
+def test_the_nearest_start_is_marked_though_another_fits_better(copy, tilt):
     one, check, alignment = of_ant(copy)
     turn = euler_starts()[3]  # By 270 degrees about z.
     starts = tuple(Candidate(s.index, s.euler_degrees, 0.9, 0.5, s.same_as) for s in euler_starts())
     starts = (replace(starts[0], fitness=0.95), *starts[1:])
-    there = make_transform(turn.rotation)
+    tilted = Rotation.from_rotvec(np.radians(tilt) * np.ones(3) / np.sqrt(3)).as_matrix()
+    there = make_transform(tilted @ turn.rotation)
     moved = replace(alignment, search=Search.EULER64, candidates=starts, transform=there)
     with canvas.styled():
         figure = draw_alignment(one, check, "t", "s", moved)
         axes = figure.axes[-1]
         (tick,) = axes.get_xticks()
-        assert [text.get_text() for text in axes.get_xticklabels()] == ["start at 0°, 0°, 270°"]
+        assert [text.get_text() for text in axes.get_xticklabels()] == [
+            "nearest start: 0°, 0°, 270°"
+        ]
     accent = to_rgba(canvas.ACCENT)
     marked = [k for k, bar in enumerate(axes.patches) if bar.get_facecolor() == accent]
     assert marked == [tick] and tick > 0

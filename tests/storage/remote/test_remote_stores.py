@@ -251,9 +251,9 @@ def test_a_bucket_or_server_that_is_not_there_is_told(bucket, server, monkeypatc
 
 
 @pytest.mark.parametrize(("status", "number"), [
-    (403, errno.ENOENT), (404, errno.ENOENT), (410, errno.ENOENT), (500, errno.EIO),
+    (403, errno.EACCES), (404, errno.ENOENT), (410, errno.ENOENT), (500, errno.EIO),
 ])  # fmt: skip
-def test_a_web_server_may_deny_what_is_not_there(status, number):
+def test_a_web_server_says_why_it_gives_no_file(status, number):
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_error(status)
