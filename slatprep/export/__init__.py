@@ -125,7 +125,7 @@ def export_store(
     tell = progress or (lambda done, total: None)
     writer: Writer = resolve_name(FORMATS[format])(opened, ids, options)
     about = _about(opened, format)
-    clipped = clipped_values(opened, ids, options.points or ("grid" if format == "usd" else "slat"))
+    clipped = clipped_values(opened, ids, writer.points)
     entries: list[_Entry] = []
     if writer.is_export is not None:
         with target.file(out, writer.is_export) as file:

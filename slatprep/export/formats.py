@@ -175,6 +175,8 @@ class Writer:
     finish : callable, optional
         Takes the folder and the index's entries, sorted by id; writes the files that cover all
         assets and returns their names.
+    points : {"slat", "grid"}
+        The voxels whose values are written.
     remarks : callable
         Takes the index's entries; returns remarks on the result for the user.
     is_export : callable, optional
@@ -185,6 +187,7 @@ class Writer:
     write: Callable[..., Iterable[Exported]]
     batch: int = 16
     finish: Callable[[Path, Sequence[dict[str, Any]]], Sequence[str]] | None = None
+    points: Points = "slat"
     remarks: Callable[[Sequence[dict[str, Any]]], tuple[str, ...]] = lambda _entries: ()
     is_export: Callable[[Path], bool] | None = None
 

@@ -162,7 +162,8 @@ FOLDER = "voxels"
 
 def voxel_data(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of an npz for each asset; see `slatprep.export.FORMATS`."""
-    return one_by_one(partial(write_voxels, options.points or "slat"))
+    points = options.points or "slat"
+    return replace(one_by_one(partial(write_voxels, points)), points=points)
 
 
 def write_voxels(points: Points, directory: Path, asset: StoredAsset) -> Exported:

@@ -60,8 +60,9 @@ UNIT_CUBE: Bounds = np.array([[-0.5] * 3, [0.5] * 3])
 def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of a PLY for each asset; see `slatprep.export.FORMATS`."""
     bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
-    one = partial(write, options.points or "slat", options.frame, bounds)
-    return replace(one_by_one(one), remarks=lambda _entries: notes)
+    points = options.points or "slat"
+    one = partial(write, points, options.frame, bounds)
+    return replace(one_by_one(one), points=points, remarks=lambda _entries: notes)
 
 
 def write(

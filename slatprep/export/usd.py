@@ -72,9 +72,10 @@ def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> 
         raise ConfigError(f"size is {options.size:g}; expected a length of 1e-06 to 1e+06 m")
     formats.require_solver_classes(store)
     _pxr("Usd")
-    one = partial(write, options.points or "grid", options.size, options.materials)
+    points = options.points or "grid"
+    one = partial(write, points, options.size, options.materials)
     finish = partial(write_scene, options.size)
-    return replace(formats.one_by_one(one), finish=finish, remarks=_remarks)
+    return replace(formats.one_by_one(one), finish=finish, points=points, remarks=_remarks)
 
 
 def write(
