@@ -72,6 +72,17 @@ def amount(count: int, noun: str) -> str:
     return f"{count:,} {noun if count == 1 else noun + 's'}"
 
 
+def first_of(names: Iterable[str], most: int = 3, number: int | None = None) -> str:
+    """Return the first names, and how many there are beside them; `number` is that of all.
+
+    >>> first_of(["cup", "ant", "fox"], 2)
+    'cup, ant and 1 more'
+    """
+    names = list(names)
+    more = (len(names) if number is None else number) - most
+    return ", ".join(names[:most]) + (f" and {more:,} more" if more > 0 else "")
+
+
 def tally(words: Iterable[object]) -> str:
     """Return how often each word occurs.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +13,7 @@ from slatprep.cli import options
 from slatprep.cli.info import show_quality, show_sentences
 from slatprep.cli.output import DONE, Output, say
 from slatprep.cli.signature import Click, command
-from slatprep.errors import amount
+from slatprep.errors import amount, first_of
 from slatprep.workers import Progress
 
 if TYPE_CHECKING:
@@ -323,11 +322,10 @@ def _counts(statuses: Mapping[str, int], aligned: int, failed: str = "not built"
 def _tell_removed(output: Output, count: int, taken_out: Mapping[str, str], verb: str) -> None:
     """Tell the number of assets that leave the store, and the first three with reasons."""
     if count:
-        named = [f"{name} ({why})" for name, why in islice(taken_out.items(), 3)]
-        more = f" and {count - 3:,} more" if count > 3 else ""
+        named = [f"{name} ({why})" for name, why in taken_out.items()]
         output.problem(
             f"removed: {amount(count, 'asset')} of the store that {verb} there: "
-            f"{', '.join(named)}{more}"
+            f"{first_of(named, number=count)}"
         )
 
 

@@ -15,7 +15,7 @@ import click
 
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, NewPath, SomePath
-from slatprep.errors import amount, tally
+from slatprep.errors import amount, first_of, tally
 from slatprep.storage.place import place_of, storage_of
 
 if TYPE_CHECKING:
@@ -453,10 +453,8 @@ def split_of_objects(
         (assignment.unlisted, "of the store in none of its lists, and left out"),
     ):
         if ids:
-            more = " ..." if len(ids) > 3 else ""
-            output.note(
-                f"note:    {amount(len(ids), 'id')} {what}: {', '.join(ids[:3])[:200]}{more}"
-            )
+            named = first_of(name[:60] for name in ids)
+            output.note(f"note:    {amount(len(ids), 'id')} {what}: {named}")
     if torn := _copies_apart(store, assignment.splits):
         output.note(
             f"note:    {amount(len(torn), 'SLAT')} with copies in other splits, under other ids "

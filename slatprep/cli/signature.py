@@ -181,7 +181,10 @@ def _taken_apart(hint: Any) -> tuple[Any, bool, tuple[Any, ...]]:
 
 
 class SomePath(click.Path):
-    """A path, which must not be empty: that would be the working folder."""
+    """A path, which must not be empty: that would be the working folder.
+
+    If it must exist and does not, the message names what is there.
+    """
 
     def convert(
         self, value: Any, parameter: click.Parameter | None, context: click.Context | None
@@ -189,6 +192,10 @@ class SomePath(click.Path):
         """Return the value as a path."""
         if value == "":
             self.fail("is empty; expected a path", parameter, context)
+        if self.exists and not os.path.lexists(value):
+            from slatprep.storage.place import storage_of
+
+            self.fail(f"{value} {storage_of(Path(value)).absent}", parameter, context)
         return super().convert(value, parameter, context)
 
 

@@ -57,8 +57,8 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
     chosen = sorted(store.ids[row] for row in rows if wanted[row])
     if not chosen:
         raise ConfigError(
-            f"{store.path}: no asset has the verdict {' or '.join(verdicts)}; those "
-            f"asked for are {tally(store.column('verdict')[list(rows)])}"
+            f"{store.path}: no asset has the verdict {' or '.join(verdicts)}; the "
+            f"verdicts are {tally(store.column('verdict')[list(rows)])}"
         )
     return chosen
 

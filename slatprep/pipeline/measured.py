@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import orjson
 
-from slatprep.errors import StoreError, amount
+from slatprep.errors import StoreError, amount, first_of
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.destination import require_free
 from slatprep.records import Engine, Number, Place, Share, Verdict
@@ -21,6 +21,9 @@ from slatprep.store.records import ERRORS, StoredRecords, manifests_of
 
 ALIKE = 0.2
 """Least share of decoys called good at which objects are too much alike for decoys to tell."""
+
+_MOST_TOLD = 0.5
+"""Greatest share of wrong assets that is told where too few decoys are there to measure it."""
 
 LEAST_TOLD = 0.001
 """Least probability of an error that is kept for an asset."""
@@ -120,26 +123,34 @@ class MeasuredErrors:
     def sentences(self) -> list[str]:
         """Say in words what was measured."""
         low, high = self.good_wrong_range
-        shares = self.wrong_share_range
+        shares, count = self.wrong_share_range, amount(len(self.decoys), "decoy")
         if self.alike:
             return [
                 f"decoys cannot tell how many of the {self.good:,} called good show another "
                 f"object: {self.passed:,} of {len(self.decoys):,} decoys are called good, too, as "
                 "objects of this dataset are alike"
             ]
-        if not self.tells:
-            return [
-                f"likely at most {math.ceil(high):,} of the {self.good:,} called good show another "
-                f"object, and at most {shares[1]:.1%} of all assets",
-                f"measured on {amount(len(self.decoys), 'decoy')} of {amount(self.assets, 'asset')}"
-                f"; an estimate needs {LEAST_TARGETS} objects and decoys of {LEAST_DECOYS}",
+        if self.tells:
+            sentences = [
+                f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "
+                f"({low:.0f} to {high:.0f}; measured on {count} of this dataset)",
+                f"of all {self.assets:,} assets about {self.wrong_share:.1%} show another object "
+                f"({shares[0]:.1%} to {shares[1]:.1%})",
             ]
-        return [
-            f"of the {self.good:,} called good about {self.good_wrong:.0f} show another object "
-            f"({low:.0f} to {high:.0f}; measured on {len(self.decoys):,} decoys of this dataset)",
-            f"of all {self.assets:,} assets about {self.wrong_share:.1%} show another object "
-            f"({shares[0]:.1%} to {shares[1]:.1%})",
-        ]
+        else:
+            likely = (
+                f"likely at most {math.ceil(high):,} of the {self.good:,} called good show another "
+                f"object, and at most {shares[1]:.1%} of all assets"
+            )
+            few = (
+                f"{count} of {amount(self.assets, 'asset')} are too few to estimate errors: "
+                f"{LEAST_TARGETS} objects and decoys of {LEAST_DECOYS} are needed"
+            )
+            sentences = [likely, few] if shares[1] <= _MOST_TOLD else [few]
+        passed = [one for one in self.decoys if one.verdict == Verdict.GOOD]
+        named = first_of(f"the grid of {one.grid} with the SLAT of {one.slat}" for one in passed)
+        told = f"decoys called good: {len(passed):,} of {len(self.decoys):,} ({named})"
+        return [*sentences, told] if passed else sentences
 
     def of_asset(self, asset_id: str) -> str:
         """Say how probable it is that an asset shows another object; valid only if this `tells`."""

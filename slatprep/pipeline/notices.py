@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.align.consensus import find_consensus
-from slatprep.errors import amount
+from slatprep.errors import amount, first_of
 from slatprep.judge import THRESHOLDS
 from slatprep.normalize import PIXIE_RANGES
 from slatprep.parameters import AlignParameters, BuildParameters
@@ -187,7 +187,7 @@ def shared_sources(
         names = [" = ".join(ids[at] for at in own[:4]) for own in groups]
         yield (
             f"{sum(map(len, groups))} assets of different objects share the same {what} "
-            f"({_first(names)}): see whether a map or a copy gave it to both"
+            f"({first_of(names)}): see whether a map or a copy gave it to both"
         )
 
 
@@ -229,12 +229,7 @@ def wild_ranges(
 
 
 def _of_assets(names: Sequence[str], every: Collection[str]) -> str:
-    return f"{len(names):,} of {len(every):,} assets ({_first(names)})"
-
-
-def _first(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"{', '.join(names[:_NAMED])}{more}"
+    return f"{len(names):,} of {len(every):,} assets ({first_of(names)})"
 
 
 def latent_warnings(new: NextStore, standardised: str) -> Iterator[str]:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError
+from slatprep.errors import InputError, MissingPartnerError, SlatprepError, StoreError, first_of
 from slatprep.records import RESOLUTION, AssetPair, Place, SourceFile
 from slatprep.storage.chunks import array_form, read_chunks
 from slatprep.storage.documents import parse_document
@@ -271,8 +271,7 @@ def npz_arrays(
         wanted = [name for name in specs if not partial or name in present]
         for name in wanted:
             if present.count(name) != 1:
-                more = f" and {len(present) - 8} more" if len(present) > 8 else ""
-                found = (", ".join(sorted(present)[:8]) or "nothing") + more
+                found = first_of(sorted(present), 8) or "nothing"
                 count = present.count(name)
                 own = f"{count} arrays named" if count else "no array"
                 fault = f"has {own} {name!r} (it holds {found})"

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, first_of
 from slatprep.records import Place
 from slatprep.storage.files import Listing
 from slatprep.storage.place import storage_of
@@ -182,9 +182,7 @@ def _walk(
 
 def held_names(files: Collection[str], folders: Collection[str]) -> str:
     """Say what lies directly in a folder, in a few names."""
-    names = sorted([*files, *folders])
-    more = " and more" if len(names) > 3 else ""
-    return f"it holds {', '.join(names[:3]) or 'nothing'}{more}"
+    return f"it holds {first_of(sorted([*files, *folders])) or 'nothing'}"
 
 
 def tried_names(patterns: Iterable[str], known: Mapping[str, str]) -> str:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.records import LOG10, PROPERTIES, Units, oddity, to_si
+from slatprep.records import FACTORS, LOG10, PROPERTIES, Units, oddity, to_si
 
 EXTENTS = (
     # The softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry and
@@ -191,6 +191,9 @@ def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
 
 def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
     """Yield common mistakes: units of one or both columns, ids of classes, and swapped columns."""
+    if scaled := {name: unit for name, unit in vars(units).items() if FACTORS.get(unit, 1.0) != 1}:
+        words = "ones in SI units, though other units are stated"
+        yield Mistake(words, f"leave {in_toml(scaled)} out", partial(_unscaled, units))
     named = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
              "density": ("g/cm^3", f"{LOG10}kg/m^3")}  # fmt: skip
     lacking = [name for name, k in (("youngs_modulus", 0), ("density", 1))
@@ -237,6 +240,14 @@ def _scaled(units: tuple[str, str], part: Part) -> Part:
     """Convert modulus and density from these units to SI units."""
     modulus, density = map(float, map(to_si, (part.modulus, part.density), units))
     return part._replace(modulus=modulus, density=density)
+
+
+def _unscaled(units: Units, part: Part) -> Part:
+    """Return modulus and density as they were in the file, where stated units only scale them."""
+    return part._replace(
+        modulus=part.modulus / FACTORS.get(units.youngs_modulus, 1.0),
+        density=part.density / FACTORS.get(units.density, 1.0),
+    )
 
 
 def _moved(order: Sequence[int], part: Part) -> Part:

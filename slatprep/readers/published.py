@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from slatprep.errors import ConfigError, SlatprepError
+from slatprep.errors import ConfigError, SlatprepError, first_of
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import source_adapter
 from slatprep.readers.patterns import LOOKED_AT, fill, held_names
@@ -59,8 +59,8 @@ def locate_grids(source: PixieverseSource, note: Callable[[str], None] | None = 
                 packed = (name for name in files if name.lower().endswith(_PACKED))
                 beside = sorted(n for n in (*folders, *packed) if not n.startswith("."))
                 if note and beside:
-                    more = f" and {len(beside) - 1:,} more" if len(beside) > 1 else ""
-                    note(f"{root}: its archives are read, but not {beside[0]}{more} beside them")
+                    unread = first_of(beside, 1)
+                    note(f"{root}: its archives are read, but not {unread} beside them")
                 return _tree(root, archives, wanted, str(root), note)
             inner = next((name for name in (GRIDS, ARCHIVES) if name in folders), "")
             if not inner:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import orjson
 
-from slatprep.errors import InputError
+from slatprep.errors import InputError, first_of
 from slatprep.storage.atomic import staged_apart
 from slatprep.storage.cache import cache_folder, short
 from slatprep.storage.files import LocalFile, open_digest, open_regular
@@ -212,8 +212,7 @@ class Index:
             names = "names occur" if self.twice > 1 else "name occurs"
             lines.append(f"{self.twice:,} {names} twice; the last one counts, as in unpacking")
         if self.strange:
-            more = f" and {len(self.strange) - 1:,} more" if len(self.strange) > 1 else ""
-            lines.append(f"left out, as no folder could hold them: {self.strange[0]}{more}")
+            lines.append(f"left out, as no folder could hold them: {first_of(self.strange, 1)}")
         return "; ".join(lines)
 
     def add(self, entry: Entry) -> None:

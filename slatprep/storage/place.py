@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
 
-from slatprep.errors import ConfigError, InputError, StoreError
+from slatprep.errors import ConfigError, InputError, StoreError, first_of
 from slatprep.storage.archives import Archive
 from slatprep.storage.atomic import staged, staged_apart
 from slatprep.storage.cache import cached_file, copied_version, folder_for
@@ -145,11 +145,12 @@ class Storage:
         if self.local is None:
             return "does not exist"
         above = next(path for path in self.local.absolute().parents if path.is_dir())
-        names = sorted(path.name for path in islice(above.iterdir(), 1000) if path.is_dir())
+        entries = sorted(islice(above.iterdir(), 1000))
         wanted = self.local.absolute().relative_to(above).parts[0]
-        if close := difflib.get_close_matches(wanted, names, n=1):
+        if close := difflib.get_close_matches(wanted, [path.name for path in entries], n=1):
             return f"does not exist; did you mean {above / close[0]}?"
-        held = ", ".join(names[:5]) or "(none)"
+        folders = (path.name for path in entries if path.is_dir() and path.name[0] != ".")
+        held = first_of(folders, 5) or "(none)"
         return f"does not exist; {above} does, and holds the folders {held}"
 
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:

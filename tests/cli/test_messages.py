@@ -111,6 +111,8 @@ def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use(words, store,
     ("build-store --slat SLAT --out NEW --pixieverse ROOT/absent", 2, "option --pixieverse: "),
     ("build-store --slat SLAT --out NEW --pixieverse ROOT/absent", 2,
      "ROOT does, and holds the folders "),
+    ("info ROOT/pixeverse", 2, "ROOT/pixeverse does not exist; did you mean ROOT/pixieverse?"),
+    ("list STORE/zarr.jsn", 2, "did you mean STORE/zarr.json?"),
 ])  # fmt: skip
 def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tmp_path):
     places = {"STORE": store, "FOLDER": tmp_path, "NEW": tmp_path / "new"}

@@ -105,13 +105,23 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
     assert "3 of 3 decoys are called good, too" in found.sentences()[0], "all are the same L"
     others = tuple(replace(one, verdict="failed") for one in found.decoys)
     few = replace(found, decoys=others, good=4, good_wrong=0.1, good_wrong_range=(0.0, 0.3))
-    assert few.sentences() == [
-        f"likely at most 1 of the 4 called good show another object, "
-        f"and at most {found.wrong_share_range[1]:.1%} of all assets",
-        "measured on 3 decoys of 5 assets; an estimate needs 50 objects and decoys of 40",
-    ]
+    needed = "50 objects and decoys of 40 are needed"
+    too_few = f"3 decoys of 5 assets are too few to estimate errors: {needed}"
+    assert few.sentences() == [too_few]
+    likely, also = replace(few, wrong_share_range=(0.0, 0.25)).sentences()
+    assert likely == (
+        "likely at most 1 of the 4 called good show another object, and at most 25.0% of all assets"
+    )
+    assert also == too_few
     enough = replace(few, refitted=True)
     assert "about 0 show another object (0 to 0; measured on 3 decoys" in enough.sentences()[0]
+    passed = replace(others[0], grid="cup", slat="mug", verdict="good")
+    assert replace(enough, decoys=(passed, *others * 2)).sentences() == [
+        "of the 4 called good about 0 show another object (0 to 0; measured on 7 decoys of this "
+        "dataset)",
+        enough.sentences()[1],
+        "decoys called good: 1 of 7 (the grid of cup with the SLAT of mug)",
+    ]
     assert enough.tells and not few.tells and not replace(found, refitted=True).tells
     picture = draw_errors(found, store.name)
     assert picture.startswith(b"\x89PNG")

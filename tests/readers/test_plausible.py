@@ -174,6 +174,17 @@ def test_what_is_stated_is_not_asked_about(read):
     assert "Such keys hold for all objects: where this one alone is so" in str(error.value)
 
 
+@pytest.mark.parametrize("stated", [
+    {"youngs_modulus": "GPa"}, {"density": "g/cm^3"},
+    {"youngs_modulus": "MPa", "density": "g/cm^3"},
+])  # fmt: skip
+def test_units_that_are_stated_for_values_in_si_units_are_to_be_left_out(read, stated):
+    with pytest.raises(InputError, match="look like ones in SI units") as error:
+        read((METAL, 2e11, 7850, 0.3), units=Units(**stated))
+    ((name, unit), *_) = stated.items()
+    assert f'leave units = {{ {name} = "{unit}"' in str(error.value)
+
+
 def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(read):
     assert "is it in MPa?" in told(read((STATIONARY, 5e4, 2700, 0.25)))[0]
     field = read(*[(JELLY, 2e6, 930, 0.49)] * 4, (METAL, 200, 7850, 0.3))
