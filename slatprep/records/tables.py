@@ -218,9 +218,8 @@ class Property:
         """Its allowed values, in words."""
         bounds = f" in [{self.least:g}, {self.most:g}]" if np.isfinite(self.most) else ""
         above = " above 0" if self.log10 else ""
-        return f"a finite {self.title}{above}{bounds}" + (
-            "" if self.unit == "1" else f" {self.unit}"
-        )
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"a finite {self.title}{above}{bounds}{unit}"
 
 
 PROPERTIES = (
