@@ -9,6 +9,12 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
+MAX_SHEAR = 1e-6
+"""Largest deviation of a similarity's rotation from an orthogonal matrix, by entry."""
+
+_MAX_SIDE = 32
+_FINITE = {"type": "float", "allow_inf_nan": False}
+
 
 @dataclass(frozen=True, eq=False)
 class InJson:
@@ -42,26 +48,17 @@ def _array(*shape: int | None) -> InJson:
     return InJson(schema, array)
 
 
-def _invertible() -> InJson:
-    read = _array(4, 4)
-
-    def map_of(values: list[Any]) -> NDArray[np.float64]:
-        matrix: NDArray[np.float64] = read.then(values)
-        if (matrix[3] != (0, 0, 0, 1)).any() or not 1e-9 < np.linalg.det(matrix[:3, :3]) < 1e9:
-            raise ValueError("no map of the frames: it has no inverse, or mirrors")
-        turned = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
-        if np.abs(turned @ turned.T - np.eye(3)).max() > MAX_SHEAR:
-            raise ValueError("no similarity: it shears, or scales one axis more than another")
-        return matrix
-
-    return InJson(read.schema, map_of)
+_MATRIX = _array(4, 4)
 
 
-MAX_SHEAR = 1e-6
-"""Largest deviation of a similarity's rotation from an orthogonal matrix, by entry."""
-
-_MAX_SIDE = 32
-_FINITE = {"type": "float", "allow_inf_nan": False}
+def _similarity(values: list[Any]) -> NDArray[np.float64]:
+    matrix: NDArray[np.float64] = _MATRIX.then(values)
+    if (matrix[3] != (0, 0, 0, 1)).any() or not 1e-9 < np.linalg.det(matrix[:3, :3]) < 1e9:
+        raise ValueError("no map of the frames: it has no inverse, or mirrors")
+    turned = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
+    if np.abs(turned @ turned.T - np.eye(3)).max() > MAX_SHEAR:
+        raise ValueError("no similarity: it shears, or scales one axis more than another")
+    return matrix
 
 
 def one_of(*values: object) -> InJson:
@@ -85,7 +82,7 @@ Number = Annotated[float, InJson({"type": "nullable", "schema": _FINITE}, _null_
 Digest = Annotated[str, InJson({"type": "str", "pattern": "^[0-9a-f]{64}$"})]
 """SHA-256 in hex."""
 
-Transform = Annotated[NDArray[np.float64], _invertible()]
+Transform = Annotated[NDArray[np.float64], InJson(_MATRIX.schema, _similarity)]
 """Homogeneous, (4, 4): PixieVerse frame to SLAT frame, a similarity."""
 
 Rotation = Annotated[NDArray[np.float64], _array(3, 3)]
