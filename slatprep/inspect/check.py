@@ -272,11 +272,9 @@ def choose_assets(
     if worst:
         places = {Verdict.FAILED: 0, Verdict.DOUBTFUL: 1, Verdict.GOOD: 2}
         rank = [places.get(verdict, -1) for verdict in store.column("verdict")]
-        fitness = np.minimum(*map(store.column, FITNESS))
+        figures = store.column("confidence"), np.minimum(*map(store.column, FITNESS))
         # Assets with NaN come first.
-        confidence, fitness = (
-            np.nan_to_num(figure, nan=-1.0) for figure in (store.column("confidence"), fitness)
-        )
+        confidence, fitness = (np.nan_to_num(figure, nan=-1.0) for figure in figures)
         rows += np.lexsort((fitness, confidence, rank))[:worst].tolist()
     if ambiguous:
         share = store.column("ambiguity")

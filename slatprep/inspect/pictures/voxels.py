@@ -106,9 +106,8 @@ def draw_voxels(
     for axis in range(3):
         sign = 1 if edges[2, axis] > 0 else -1
         step = sign * np.eye(3, dtype=np.intp)[axis]
-        neighbour = voxels + 1 + step
-        exposed = np.flatnonzero(empty[neighbour[:, 0], neighbour[:, 1], neighbour[:, 2]])
-        spanned = edges[:, [a for a in range(3) if a != axis]]
+        exposed = np.flatnonzero(empty[tuple((voxels + 1 + step).T)])
+        spanned = np.delete(edges, axis, axis=1)
         template = _side_pixels(spanned * pixels_per_unit)
         if template is None or len(exposed) == 0:
             continue
@@ -164,7 +163,7 @@ def _resolve(buffer: NDArray[np.int64], lit: NDArray[np.float64], view: View) ->
     tone = np.where(buffer & 1, 1.0, _SEAM)
     depth = np.where(covered, (buffer >> _FACE_BITS) / _DEPTH_STEPS * 8 * view.half_width, -np.inf)
     tone = np.where(covered & _steps_down(depth), _OUTLINE, tone)
-    white = np.array([[1.0, 1.0, 1.0]])
+    white = np.ones((1, 3))
     table = np.concatenate([np.clip(lit, 0, 1), white])
     rgb = table[np.where(covered, face, len(lit))] * np.where(covered, tone, 1.0)[..., None]
     return Drawing(_averaged(rgb), _averaged(covered.astype(np.float64)))
