@@ -270,9 +270,8 @@ def npz_arrays(
         present = [info.filename.removesuffix(".npy") for info in infos]
         wanted = [name for name in specs if not partial or name in present]
         for name in wanted:
-            if present.count(name) != 1:
+            if (count := present.count(name)) != 1:
                 found = first_of(sorted(present), 8) or "nothing"
-                count = present.count(name)
                 own = f"{count} arrays named" if count else "no array"
                 fault = f"has {own} {name!r} (it holds {found})"
                 raise InputError(where, fault, f"one array each of {', '.join(specs)}")

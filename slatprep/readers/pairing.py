@@ -108,8 +108,7 @@ def discover(
     grids, slats = each[0], find_slats(slat, folder != slat.root)
     claims = {} if pairing.map is None else read_map(pairing.map, grids, slats)
     categories = {} if pairing.categories is None else read_categories(pairing.categories)
-    damaged: dict[str, list[adapters.FoundField]]
-    damaged = {name: [] for name in _damaged_in(parameters.also, each)}
+    damaged = _damaged_in(parameters.also, each)
     rows = list(_rows(damaged | grids, slats, claims, each_sample=pixieverse.samples == "all"))
     rows.sort(key=lambda row: (row.asset_id, row.object_id))
     contents, cases = contents_of(parameters), by_case(grids, slats)
@@ -128,8 +127,8 @@ def discover(
 
 def _damaged_in(
     also: Sequence[PixieverseSource], each: Sequence[Mapping[str, list[adapters.FoundField]]]
-) -> set[str]:
-    """Return the names of what cannot be read in further sources, such as damaged archives.
+) -> dict[str, list[adapters.FoundField]]:
+    """Return what cannot be read in further sources, such as damaged archives: no grids by name.
 
     `each` has the grids of all sources. ConfigError if a further one has no object of the first.
     """
@@ -141,7 +140,7 @@ def _damaged_in(
                 f"{source.root}: has none of the objects that [pixieverse] has; expected ids such "
                 f"as {min(grids)!r}, found {min(own)!r}"
             )
-    return set().union(*broken[1:])
+    return {name: [] for faults in broken[1:] for name in faults}
 
 
 def _unused(pairs: Sequence[AssetPair], sources: Sequence[PixieverseSource]) -> Iterator[str]:

@@ -51,7 +51,6 @@ def field_of_voxels(
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
     whole = np.asarray(voxels).dtype.kind != "f"
-    once = whole and bool(description)
     if whole and (roots is None or roots.plausibility != "off"):
         way = f"say the grid's own resolution in {description}"
         anew = f"make the voxels of a grid of {resolution}^3"
@@ -85,7 +84,7 @@ def field_of_voxels(
     flat = flat_index(cells, side)
     cell, labels, means = _merged(flat[keep], own[keep], values[keep], table)
     if len(cell) < np.count_nonzero(keep):
-        if once:
+        if whole and description:
             own_cells = flat_index(index, resolution)
             _require_alike(where, np.flatnonzero(keep), own_cells, own, values)
         notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(cell)} of {side}^3")
