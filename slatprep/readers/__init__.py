@@ -61,7 +61,7 @@ def read_field(
     -------
     MaterialField
         Occupancy, and class and SI properties of the annotated voxels.
-        `slatprep.readers.pixieverse.read_grid` says what counts as annotated in PixieVerse.
+        `slatprep.readers.pixieverse.PixieVerse` says what counts as annotated in PixieVerse.
 
     Raises
     ------

@@ -66,76 +66,72 @@ class PixieVerse(SourceAdapter):
         return Holding()
 
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
-        """Read a grid or a prediction; see `read_grid`."""
-        return read_grid(pair, max_unphysical)
+        """Read the PixieVerse side of a pair: a raw grid or a prediction, and its mask if any.
 
+        A raw grid is (64, 64, 64, 4): density [kg/m^3], Young's modulus [Pa], Poisson's ratio,
+        class id. A prediction is (11, 64, 64, 64) or (4, 64, 64, 64): the same three properties,
+        then eight class scores or a class id. Properties are normalised to [-1, 1] by Pixie's
+        published ranges.
 
-def read_grid(pair: AssetPair, max_unphysical: float) -> MaterialField:
-    """Read the PixieVerse side of a pair: a raw grid or a prediction, and its mask if any.
+        A voxel is occupied if the (64, 64, 64) mask says so or, without a mask, if it is not
+        background. It is annotated if it is occupied, of class 0 to 6, its density and Young's
+        modulus are finite and positive, and its Poisson's ratio is in [0, 0.5]. The properties of a
+        prediction need only be finite. InputError names file, value and voxel.
+        """
+        path, _ = files.require_complete(pair)
+        root = pair.roots.pixieverse
+        channels, raw, source = _channels_of(path, root)
+        sources = [source]
+        warnings: list[str] = []
 
-    A raw grid is (64, 64, 64, 4): density [kg/m^3], Young's modulus [Pa], Poisson's ratio, class
-    id. A prediction is (11, 64, 64, 64) or (4, 64, 64, 64): the same three properties, then eight
-    class scores or a class id. Properties are normalised to [-1, 1] by Pixie's published ranges.
+        mask = None
+        if pair.mask is not None:
+            data, source = files.load_source(pair.mask, root, "mask")
+            sources.append(source)
+            mask = _read_mask(files.npy_array(data, pair.mask, MASK), pair.mask, warnings)
 
-    A voxel is occupied if the (64, 64, 64) mask says so or, without a mask, if it is not
-    background. It is annotated if it is occupied, of class 0 to 6, its density and Young's modulus
-    are finite and positive, and its Poisson's ratio is in [0, 0.5]. The properties of a prediction
-    need only be finite. InputError names file, value and voxel.
-    """
-    path, _ = files.require_complete(pair)
-    root = pair.roots.pixieverse
-    channels, raw, source = _channels_of(path, root)
-    sources = [source]
-    warnings: list[str] = []
+        material = _classes_of(channels, mask, path, warnings)
+        occupancy = material != BACKGROUND if mask is None else mask
+        if not occupancy.any():
+            raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
+        annotated = _annotated(occupancy, material, path, warnings)
+        if pair.mask is not None and raw:
+            warnings += _contradictions(pair.mask, occupancy, material, pair.roots.plausibility)
 
-    mask = None
-    if pair.mask is not None:
-        data, source = files.load_source(pair.mask, root, "mask")
-        sources.append(source)
-        mask = _read_mask(files.npy_array(data, pair.mask, MASK), pair.mask, warnings)
+        cells = np.flatnonzero(annotated)
+        voxels = voxels_at(cells)
+        properties, classes = _gather(channels, cells), material.reshape(-1)[cells].astype(np.uint8)
+        if raw:
+            held = properties, classes, PROPERTIES, MATERIAL_CLASSES
+            warnings += require_plausible(path, *held, pair.roots)
+        else:
+            warnings += require_prediction(path, properties, classes, pair.roots.plausibility)
 
-    material = _classes_of(channels, mask, path, warnings)
-    occupancy = material != BACKGROUND if mask is None else mask
-    if not occupancy.any():
-        raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
-    annotated = _annotated(occupancy, material, path, warnings)
-    if pair.mask is not None and raw:
-        warnings += _contradictions(pair.mask, occupancy, material, pair.roots.plausibility)
+        def told(row: int, column: int) -> tuple[str, Any]:
+            at = tuple(voxels[row].tolist())
+            value = channels[_CHANNEL_ORDER[column]][at]
+            return f"{PROPERTIES[column].title} {value:g} at annotated voxel {at}", value
 
-    cells = np.flatnonzero(annotated)
-    voxels = voxels_at(cells)
-    properties, classes = _gather(channels, cells), material.reshape(-1)[cells].astype(np.uint8)
-    if raw:
-        held = properties, classes, PROPERTIES, MATERIAL_CLASSES
-        warnings += require_plausible(path, *held, pair.roots)
-    else:
-        warnings += require_prediction(path, properties, classes, pair.roots.plausibility)
+        fine = physical(properties, PROPERTIES) if raw else np.isfinite(properties)
+        keep = physical_rows(path, fine, PROPERTIES, told, max_unphysical, warnings)
+        if unphysical := int(np.count_nonzero(~keep)):
+            voxels, properties, classes = voxels[keep], properties[keep], classes[keep]
+        if not raw:
+            properties = _to_si(properties, warnings)
 
-    def told(row: int, column: int) -> tuple[str, Any]:
-        at = tuple(voxels[row].tolist())
-        value = channels[_CHANNEL_ORDER[column]][at]
-        return f"{PROPERTIES[column].title} {value:g} at annotated voxel {at}", value
-
-    fine = physical(properties, PROPERTIES) if raw else np.isfinite(properties)
-    keep = physical_rows(path, fine, PROPERTIES, told, max_unphysical, warnings)
-    if unphysical := int(np.count_nonzero(~keep)):
-        voxels, properties, classes = voxels[keep], properties[keep], classes[keep]
-    if not raw:
-        properties = _to_si(properties, warnings)
-
-    bounds = None
-    if pair.bounds is not None:
-        bounds = _read_bounds(pair.bounds, root, sources, warnings)
-    return MaterialField(
-        occupancy=occupancy,
-        voxels=voxels,
-        material=classes,
-        properties=np.ascontiguousarray(properties),
-        unphysical=unphysical,
-        bounds=bounds,
-        sources=tuple(sources),
-        warnings=tuple(warnings),
-    )
+        bounds = None
+        if pair.bounds is not None:
+            bounds = _read_bounds(pair.bounds, root, sources, warnings)
+        return MaterialField(
+            occupancy=occupancy,
+            voxels=voxels,
+            material=classes,
+            properties=np.ascontiguousarray(properties),
+            unphysical=unphysical,
+            bounds=bounds,
+            sources=tuple(sources),
+            warnings=tuple(warnings),
+        )
 
 
 def read_prediction(
@@ -143,7 +139,7 @@ def read_prediction(
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Read properties (K, 3) and classes (K,) of a grid at the K voxels of the mask `where`.
 
-    The grid has a form of `read_grid`; its own mask is ignored. The returned properties are
+    The grid has a form of `PixieVerse.read`; its own mask is ignored. The returned properties are
     normalised by `normalization`. Normalised values are converted without clipping. SI values are
     normalised as Pixie does it: 1e-6 is added before log10, and the result is clipped. A class is
     background if several scores are the highest, or the id is -1. InputError if the grid has

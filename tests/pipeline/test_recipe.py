@@ -129,7 +129,7 @@ def test_it_is_the_same_under_another_python(minor):
 def test_it_covers_every_module_that_an_asset_runs_through_and_is_the_same_elsewhere():
     """Trace what is loaded for one asset, in a process that has loaded nothing else."""
     code = (
-        "import sys; from slatprep.readers.pixieverse import read_grid; "
+        "import sys; from slatprep.readers.pixieverse import PixieVerse; "
         "from slatprep.readers.slat import read_slat; from slatprep.sample import sample; "
         "from slatprep.judge import judge; from slatprep.align import quality, field; "
         "print(*(m for m in sys.modules if m.startswith('slatprep'))); "
