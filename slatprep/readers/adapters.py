@@ -168,17 +168,17 @@ def find_by_pattern(
     If `first`, yield only those of an object's first matching pattern. Raises ConfigError if a
     pattern has no ``{id}``.
     """
-    done: dict[str, object] = {}
+    done: set[str] = set()
     for pattern in patterns:
         if "{id}" not in pattern:
             raise ConfigError(f"grid pattern {pattern!r} names no {{id}}")
         found = [
             FoundField(fields.get("id", path), path, fields.get("sample", ""), problem)
             for fields, path, problem in find_files(
-                listing, pattern, known, skip=done if first else {}
+                listing, pattern, known, skip=done if first else ()
             )
         ]
-        done |= dict.fromkeys(one.object_id for one in found)
+        done |= {one.object_id for one in found}
         yield from found
 
 

@@ -43,6 +43,9 @@ MAX_FILES = 4096
 
 _MAX_HEADER_BYTES, _MAX_METADATA_BYTES = 4096, 2**16
 
+_MAX_ITEMS = 64
+"""Largest number of values of an array that may have any shape."""
+
 _KIND_NAMES = {
     "b": "booleans",
     "i": "integers",
@@ -91,13 +94,12 @@ class ArraySpec:
     """Shapes and numpy dtype kinds that an array in a source file may have.
 
     In a shape, None stands for 0 to `max_rows` rows, and a range for any size in it. Without
-    `shapes`, any shape of 1 to `max_items` values is allowed. An error adds `note` to the allowed
+    `shapes`, any shape of 1 to `_MAX_ITEMS` values is allowed. An error adds `note` to the allowed
     shapes. A file may state the `unit` of the values; an empty one allows any.
     """
 
     shapes: tuple[tuple[int | range | None, ...], ...]
     kinds: str
-    max_items: int = 64
     note: str = ""
     max_rows: int = RESOLUTION**3
     unit: str = ""
@@ -114,9 +116,9 @@ class ArraySpec:
         if self.shapes and not any(self._fits(shape, allowed) for allowed in self.shapes):
             texts = " or ".join(_shape_text(allowed, self.max_rows) for allowed in self.shapes)
             raise InputError(where, f"has shape {_shape_text(shape)}", f"shape {texts}{self.note}")
-        if not self.shapes and (len(shape) > 8 or not 0 < math.prod(shape) <= self.max_items):
+        if not self.shapes and (len(shape) > 8 or not 0 < math.prod(shape) <= _MAX_ITEMS):
             fault = f"has shape {_shape_text(shape)}"
-            raise InputError(where, fault, f"1 to {self.max_items} values")
+            raise InputError(where, fault, f"1 to {_MAX_ITEMS} values")
 
     def check_attributes(
         self, where: str | Place, attributes: Mapping[str, Any], values: NDArray[Any]

@@ -178,15 +178,15 @@ def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
         return [Mistake("normalised ones", setting, lambda part: part)]
     whole = sum(part.share for part in parts)
     found = []
-    for order, mistake in enumerate(_known_mistakes(parts, units)):
+    for mistake in _known_mistakes(parts, units):
         undone = [mistake.undo(part) for part in parts]
         good = sum(part.share for part in undone if not fault_of(part))
         if good >= 0.9 * whole:
             usual = sum(part.share for part in undone if is_usual(part))
-            found.append((-round(usual / whole, 1), order, mistake))
-    found.sort(key=lambda one: one[:2])
+            found.append((-round(usual / whole, 1), mistake))
+    found.sort(key=lambda one: one[0])  # Of equal ones, the likelier stays first.
     best = found[0][0] if found else 0.0
-    return [mistake for usual, _, mistake in found if usual <= best + 0.25]
+    return [mistake for usual, mistake in found if usual <= best + 0.25]
 
 
 def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:

@@ -172,9 +172,8 @@ def read_lists(path: Place) -> dict[Split, tuple[str, ...]]:
             listed = parse_json(data)
             json.loads(data, object_pairs_hook=unique)  # parse_json takes the last of two keys.
         else:
-            listed = [
-                line.strip() for line in data.decode("utf-8-sig").splitlines() if line.strip()
-            ]
+            lines = map(str.strip, data.decode("utf-8-sig").splitlines())
+            listed = [line for line in lines if line]
     lists = listed if isinstance(listed, dict) else {"test": listed}
     for name, ids in lists.items():
         if name not in SPLITS:
