@@ -196,14 +196,13 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
         yield Mistake(words, f"leave {in_toml(scaled)} out", partial(_unscaled, units))
     named = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
              "density": ("g/cm^3", f"{LOG10}kg/m^3")}  # fmt: skip
-    lacking = [name for name, k in (("youngs_modulus", 0), ("density", 1))
-               if all(math.isnan(part.values[k]) for part in parts)]  # fmt: skip
-    modulus, density = (
-        [""] if units.of(name) or name in lacking else ["", *known] for name, known in named.items()
-    )
+    choices = []
+    for k, (name, known) in enumerate(named.items()):
+        lacking = all(math.isnan(part.values[k]) for part in parts)
+        choices.append([""] if lacking or units.of(name) else ["", *known])
     # Among pairs of units, two logarithms are the likeliest.
     pairs = sorted(
-        product(modulus, density),
+        product(*choices),
         key=lambda pair: (sum(map(bool, pair)), not all(one.startswith(LOG10) for one in pair)),
     )
     for pair in pairs[1:]:
@@ -220,10 +219,10 @@ def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
             "class ids 0 jelly, 1 metal, 2 sand, 3 visplas, 4 fluid, 5 snow, 6 stationary",
             lambda part: part._replace(name=""),
         )
+    if any(math.isnan(value) for part in parts for value in part.values):
+        return
     names = "Young's modulus", "density", "Poisson's ratio"
     for order in list(permutations(range(3)))[1:]:
-        if any(math.isnan(part.values[k]) for part in parts for k in range(3)):
-            break
         moved = [f"{names[k]} where {names[at]} belongs" for at, k in enumerate(order) if at != k]
         yield Mistake(
             f"swapped columns, {' and '.join(moved)}", "look at the order", partial(_moved, order)
@@ -236,7 +235,7 @@ def in_toml(units: Mapping[str, str]) -> str:
     return given and f"units = {{ {given} }}"
 
 
-def _scaled(units: tuple[str, str], part: Part) -> Part:
+def _scaled(units: Sequence[str], part: Part) -> Part:
     """Convert modulus and density from these units to SI units."""
     modulus, density = map(float, map(to_si, (part.modulus, part.density), units))
     return part._replace(modulus=modulus, density=density)
