@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from slatprep.align.deform import CLEAN, Deformed
 from slatprep.align.figures import measure_figures
 from slatprep.align.finish import as_free, finish, rank_of
-from slatprep.align.ground import GROUND_GAIN, LEAST_ABOVE, RAISED, find_layers, gain, raised
+from slatprep.align.ground import GROUND_GAIN, LEAST_ABOVE, RAISED, find_layers, gain, raised, worth
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE, DISTINCT, MOST_SURVIVORS, POLISH, TIE, Pair
 from slatprep.align.pose import Pose, Similarity
@@ -97,7 +97,7 @@ def align(
 
 def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignment:
     """Return the best alignment without a flat layer if it is clearly better, else `found`."""
-    best, most = found, GROUND_GAIN
+    best, most = found, -np.inf
     for ground in (raised(layer, by) for layer in find_layers(pair.pixie) for by in RAISED):
         solid = above(field.occupancy, ground)
         if np.count_nonzero(solid) < LEAST_ABOVE * np.count_nonzero(field.occupancy):
@@ -108,8 +108,10 @@ def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignme
             continue
         without = replace(_alignment(there, candidates), ground=ground)
         # A placement that leads after the search may score less once it is finished.
-        if without.score >= found.score and (rise := gain(without, found)) > most:
-            best, most = without, rise
+        if without.score >= found.score and (rise := gain(without, found)) > GROUND_GAIN:
+            rank = worth(rise, ground, field.occupancy, solid)
+            if rank > most:
+                best, most = without, rank
     return best
 
 

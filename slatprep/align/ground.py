@@ -7,6 +7,7 @@ centroids of the two sides do not match, and the floor has more surface than the
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slatprep.align.surface import DILATION, Surface, even_choice
 from slatprep.geometry.deformation import GRAIN
@@ -44,6 +45,10 @@ RAISED = (0.0, 1.0, 2.0)
 
 GROUND_GAIN = 0.05
 """Rise of the score without a layer above which the layer is ground."""
+
+WIDTH, WIDE = 0.3, 1.2
+"""Rise of the score that counts as much as ground that is wider by the width of what stands on it,
+and the width from which on more does not count. Ground is seldom the narrower one."""
 
 
 def find_layers(surface: Surface) -> list[Ground]:
@@ -88,6 +93,24 @@ def gain(without: Alignment, found: Alignment) -> float:
         return rise
     slat, pixie = here.score_slat - there.score_slat, here.score_pixieverse - there.score_pixieverse
     return max(rise, 0.5 * (slat + pixie))
+
+
+def worth(
+    rise: float, layer: Ground, occupancy: NDArray[np.bool_], solid: NDArray[np.bool_]
+) -> float:
+    """Return what ranks layers: the gain, and the width of what `solid` leaves of `occupancy`."""
+    left_out, standing = (_width(voxels, layer.normal) for voxels in (occupancy & ~solid, solid))
+    return rise + WIDTH * min(left_out / max(standing, 1.0), WIDE)
+
+
+def _width(voxels: NDArray[np.bool_], normal: Array) -> float:
+    """Return the radius of 95 % of a set's voxels around their mean, seen along the normal."""
+    places = np.argwhere(voxels).astype(np.float64)
+    if not len(places):
+        return 0.0
+    places -= places.mean(axis=0)
+    places -= np.outer(places @ normal, normal)
+    return float(np.quantile(np.linalg.norm(places, axis=1), 0.95))
 
 
 def _rounded(normal: Array, height: float) -> Ground:

@@ -12,7 +12,7 @@ from support.shapes import GRID, chair, field_of, judged, surface_latents
 from slatprep import records
 from slatprep.align import align
 from slatprep.align import field as engine
-from slatprep.align.ground import find_layers, gain
+from slatprep.align.ground import WIDE, WIDTH, find_layers, gain, worth
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
@@ -104,6 +104,17 @@ def test_a_rug_on_a_disc_of_about_its_size_is_placed(scale, mark):
     rug |= (np.hypot(x - 36, y - 34) < mark) & (z >= FOOT) & (z < FOOT + 5)
     disc = (z >= FOOT - 4) & (z < FOOT + 1) & (np.hypot(x - 31.5, y - 31.5) < 20)
     hold_placed(rug, disc, scale, 0.5)
+
+
+def test_of_two_layers_the_wider_one_is_the_ground():
+    """A block of 20 x 20 on a slab of 60 x 60: either may be left out, and the other stands."""
+    x, y, z = np.moveaxis(GRID, -1, 0)
+    wide = (abs(x - 31.5) < 30) & (abs(y - 31.5) < 30) & (z >= 10) & (z < 13)
+    block = (abs(x - 31.5) < 10) & (abs(y - 31.5) < 10) & (z >= 13) & (z < 20)
+    up, down = (records.Ground(np.array([0.0, 0.0, way]), 0.0) for way in (1.0, -1.0))
+    assert worth(0.1, up, wide | block, block) == pytest.approx(0.1 + WIDTH * WIDE)
+    assert worth(0.1, down, wide | block, wide) == pytest.approx(0.1 + WIDTH / 3, abs=0.01)
+    assert worth(0.1, up, block, block) == pytest.approx(0.1), "nothing is left out"
 
 
 def test_what_may_bend_is_not_held_against_what_may_not():
