@@ -101,7 +101,7 @@ def read_categories(path: Place) -> dict[str, str]:
                 f"{path}: the obj_class of {object_id[:80]!r} has {len(category)} letters; "
                 f"expected at most {MAX_NAME_BYTES // 4}"
             )
-        categories[object_id] = in_unicode(category)
+        categories[object_id] = in_unicode(category.strip())
     return categories
 
 
@@ -151,7 +151,8 @@ def _joins(table: Place, grids: Collection[str], slats: Collection[str]) -> bool
 def by_case(grids: Iterable[str], slats: Iterable[str]) -> dict[str, str]:
     """Return the other side's id for each id that occurs there only in another letter case."""
     ours, theirs = set(grids), set(slats)
-    folded = {name.casefold(): name for name in theirs - ours}
-    pairs = [(name, folded.get(name.casefold())) for name in ours - theirs]
-    both = {name: other for name, other in pairs if other}
-    return both | {other: name for name, other in both.items()}
+    found = dict[str, str]()
+    for names, others in (ours - theirs, theirs - ours), (theirs - ours, ours - theirs):
+        folded = {other.casefold(): other for other in sorted(others, reverse=True)}
+        found |= {name: folded[name.casefold()] for name in names if name.casefold() in folded}
+    return found

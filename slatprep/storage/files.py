@@ -60,6 +60,7 @@ class LocalFolder:
     """
 
     prefetch_bytes = 0
+    _close = staticmethod(os.close)  # When the interpreter ends, `os` may be gone before a folder.
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
@@ -79,7 +80,7 @@ class LocalFolder:
 
     def __del__(self) -> None:
         if hasattr(self, "_descriptor"):  # else it could not be opened
-            os.close(self._descriptor)
+            self._close(self._descriptor)
 
 
 def open_regular(path: Path) -> LocalFile:

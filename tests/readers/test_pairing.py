@@ -21,7 +21,7 @@ from slatprep.errors import ConfigError, InputError, MissingPartnerError
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import discover, read_field, read_latents
 from slatprep.readers.files import require_complete
-from slatprep.readers.joins import explain_unmatched
+from slatprep.readers.joins import by_case, explain_unmatched
 from slatprep.readers.patterns import match
 from slatprep.records import AssetPair, SourceRoots
 from slatprep.storage.place import storage_of
@@ -368,8 +368,8 @@ def test_a_table_that_is_a_pipe_or_beyond_reason_is_not_read(find, tmp_path, key
 
 def test_categories(find, tmp_path):
     table = tmp_path / "obj_ids_metadata.json"
-    entry = {"obj_class": "soda_cans", "vlm_filtering": {"is_appropriate": True}}
-    table.write_text(json.dumps({"a": entry}))
+    entry = {"obj_class": " soda_cans ", "vlm_filtering": {"is_appropriate": True}}
+    table.write_text(json.dumps({"a": entry, "b": {"obj_class": "  "}}))
     pairs = find([grid("a"), grid("b")], ["a.npz", "b.npz"], categories=table)
     assert [pair.category for pair in pairs] == ["soda_cans", ""]
 
@@ -510,6 +510,14 @@ def test_id_in_other_letters_is_named_on_both_sides(root):
     assert "a SLAT is called 'A'" in problems["a"]
     assert "a grid is called 'a'" in problems["A"]
     assert not problems["b"]
+
+
+def test_of_several_ids_in_other_letters_the_first_is_named():
+    names = [f"{a}{b}{c}" for a in "cC" for b in "uU" for c in "pP"]
+    for slats in (names[1:], names[:0:-1]):
+        cases = by_case(["cup"], slats)
+        assert cases == {"cup": "CUP"} | dict.fromkeys(slats, "cup")
+        assert by_case(slats, ["cup"]) == cases
 
 
 def test_slats_one_folder_deeper_are_named(root):
