@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import orjson
 
-from slatprep.errors import StoreError, amount, first_of
+from slatprep.errors import StoreError, amount
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.destination import require_free
 from slatprep.records import Engine, Number, Place, Share, Verdict
@@ -106,14 +106,14 @@ class MeasuredErrors:
     decoys: tuple[Decoy, ...]
 
     @property
-    def passed(self) -> int:
-        """Number of decoys called good."""
-        return sum(one.verdict == Verdict.GOOD for one in self.decoys)
+    def passed(self) -> list[Decoy]:
+        """The decoys that are called good."""
+        return [one for one in self.decoys if one.verdict == Verdict.GOOD]
 
     @property
     def alike(self) -> bool:
         """Whether objects are too much alike for decoys to tell."""
-        return self.passed >= ALIKE * len(self.decoys)
+        return len(self.passed) >= ALIKE * len(self.decoys)
 
     @property
     def tells(self) -> bool:
@@ -127,8 +127,8 @@ class MeasuredErrors:
         if self.alike:
             return [
                 f"decoys cannot tell how many of the {self.good:,} called good show another "
-                f"object: {self.passed:,} of {len(self.decoys):,} decoys are called good, too, as "
-                "objects of this dataset are alike"
+                f"object: {len(self.passed):,} of {count} are called good, too, as objects of "
+                "this dataset are alike"
             ]
         if self.tells:
             sentences = [
@@ -147,10 +147,10 @@ class MeasuredErrors:
                 f"{LEAST_TARGETS} objects and decoys of {LEAST_DECOYS} are needed"
             )
             sentences = [likely, few] if shares[1] <= _MOST_TOLD else [few]
-        passed = [one for one in self.decoys if one.verdict == Verdict.GOOD]
-        named = first_of(f"the grid of {one.grid} with the SLAT of {one.slat}" for one in passed)
-        told = f"decoys called good: {len(passed):,} of {len(self.decoys):,} ({named})"
-        return [*sentences, told] if passed else sentences
+        if passed := self.passed:
+            pair = f"the grid of {passed[0].grid} with the SLAT of {passed[0].slat}"
+            sentences.append(f"called good of {count}: {len(passed):,}, such as {pair}")
+        return sentences
 
     def of_asset(self, asset_id: str) -> str:
         """Say how probable it is that an asset shows another object; valid only if this `tells`."""

@@ -120,7 +120,7 @@ def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):
         "of the 4 called good about 0 show another object (0 to 0; measured on 7 decoys of this "
         "dataset)",
         enough.sentences()[1],
-        "decoys called good: 1 of 7 (the grid of cup with the SLAT of mug)",
+        "called good of 7 decoys: 1, such as the grid of cup with the SLAT of mug",
     ]
     assert enough.tells and not few.tells and not replace(found, refitted=True).tells
     picture = draw_errors(found, store.name)
