@@ -8,7 +8,7 @@ import pandas
 import plyfile
 import pytest
 from support.commands import refused, run
-from support.exports import hold_truth, index_of
+from support.exports import hold_colours, hold_truth, index_of
 from support.made_store import edit_attributes, edit_record, rewrite
 from support.raw_sources import field_at
 from support.synthetic import JELLY, METAL, QUARTER_TURN, MakeDataset
@@ -18,6 +18,7 @@ from slatprep.export import ExportOptions, export_store
 from slatprep.export.ply import VERTEX, write_points
 from slatprep.learn.evaluate import evaluate_store
 from slatprep.learn.metrics import OURS
+from slatprep.parameters import SampleParameters
 from slatprep.pipeline.dataset import build_store
 from slatprep.records import MATERIAL_CLASSES
 from slatprep.store import open_store
@@ -52,6 +53,9 @@ def test_an_npz_export_is_what_trellis_loads(model, store, mixed, tmp_path):
         np.testing.assert_array_equal(coords, mixed.assets[name].coords)
         np.testing.assert_array_equal(feats, mixed.assets[name].feats)
         assert loaded.loads[index] == len(coords)
+    table, stored = pandas.read_csv(tmp_path / "root" / "metadata.csv"), open_store(store)
+    for name in ("confidence", "expected_accuracy"):
+        np.testing.assert_allclose(table[name], stored.column(name))
     most = sorted(loaded.loads)[2]
     few = StructuredLatents(tmp_path / "root", model or ENCODER, 9.0, most).names
     assert len(few) == sum(load <= most for load in loaded.loads)
@@ -236,6 +240,8 @@ def test_ply_is_read_by_plyfile_and_open3d_as_pixie_writes_it(store, mixed, tmp_
         np.testing.assert_allclose((positions + 0.5) * 64 - 0.5, asset.coords, atol=1e-5)
         assert (vertex["part_label"] == vertex["material_id"]).all()
         hold_truth(*(vertex[name] for name in ("material_id", "E", "density", "nu")))
+        shown = np.column_stack([vertex[name] for name in ("red", "green", "blue")])
+        hold_colours(vertex["material_id"], shown)
         # These assets are placed exactly, so every annotation is the voxel's own.
         np.testing.assert_allclose(vertex["conf"], 1.0, atol=1e-3)
     cloud = open3d.t.io.read_point_cloud(str(tmp_path / "ply" / entry["file"]))
@@ -262,6 +268,16 @@ def test_grid_points_are_the_field_itself_in_either_frame(store, mixed, tmp_path
     for vertex in (world, slat):
         np.testing.assert_array_equal(vertex["material_id"], truth[:, 3])
         np.testing.assert_allclose(vertex["density"], truth[:, 0], rtol=1e-4)
+
+
+def test_slat_points_lie_where_they_were_looked_up_and_count_less_from_afar(copy, tmp_path):
+    rewrite(copy, "voxel/distance", slice(None), 0.5)
+    rewrite(copy, "voxel/place", (slice(None), 0), 0.25)
+    export_store(copy, tmp_path / "ply", "ply", options=ExportOptions(frame="pixieverse"))
+    vertex = plyfile.PlyData.read(tmp_path / "ply" / "cup.ply")["vertex"]
+    # The bounds, -0.5 and 0.5, are the centres of the first and the last voxel.
+    np.testing.assert_allclose(vertex["x"], 0.25 * 64 / 63, rtol=1e-6)
+    np.testing.assert_allclose(vertex["conf"], 1 - 0.5 / SampleParameters().max_distance)
 
 
 def test_world_bounds_of_the_records_are_used(make_dataset: MakeDataset, tmp_path):

@@ -139,6 +139,7 @@ def test_the_wind_meets_the_shadow_of_what_is_convex(seed):
     shadow = across @ [size[1] * size[2], size[0] * size[2], size[0] * size[1]] * SPACING**2
     np.testing.assert_allclose(windward(box, way, SPACING).sum(), shadow)
     assert not windward(box, np.zeros(3), SPACING).any()
+    assert (windward([[0, 0, 0], [SPACING, 0, 0]], [9, 0, 0], SPACING) == [SPACING**2, 0]).all()
 
 
 @needs_newton
@@ -284,6 +285,8 @@ def test_an_affine_motion_deforms_covariances_where_asked(seed):
     eyes = np.broadcast_to(np.eye(3), turned.shape)
     np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), eyes, atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(turned), 1.0)
+    # Where a side has turned inside out a little, the others tell how it is turned.
+    np.testing.assert_allclose(gaussians.rotations(turned * [1, 0.9, -0.1]), turned, atol=1e-9)
 
 
 def test_files_of_gaussians_keep_every_field(tmp_path):
@@ -458,16 +461,23 @@ def test_what_is_given_for_the_whole_object_is_taken(tmp_path, monkeypatch):
     share = len(motion.prepare(field, None, None, None, 10).positions) / 10**3 / volume
     assert told.startswith(f"the particles fill {share:.3g} times the object's volume")
 
-    def still(places: np.ndarray, *_: object, fixed: np.ndarray, **options: object) -> Motion:
-        held.append((fixed, options))
+    def still(
+        places: np.ndarray, *stuff: np.ndarray, fixed: np.ndarray, **options: object
+    ) -> Motion:
+        held.append((fixed, {"places": places, "apart": stuff[2], **options}))
         return Motion(places[None], np.eye(3, dtype=np.float32))
 
     held: list[tuple[np.ndarray, dict[str, object]]] = []
     monkeypatch.setattr("slatprep.particles.simulate.simulate_motion", still)
+    heights = scene.positions[:, 2]
+    potted = heights > heights.max() - 0.1 / 32
+    scene.material[potted] = np.resize([2, 6], potted.sum())  # Soil and its pot do not move.
     motion.run(scene, size=0.5, height=0.3, wind=4.0, device="cpu", seconds=1)
     ((fixed, options),) = held
-    heights = scene.positions[:, 2]
-    np.testing.assert_array_equal(fixed, heights < heights.min() + 1.1 / 32)  # the lowest layers
+    np.testing.assert_array_equal(options["places"], scene.positions / 2)
+    assert options["apart"] == 0.5 / 32
+    lowest = heights < heights.min() + 1.1 / 32
+    np.testing.assert_array_equal(fixed, lowest | potted)
     assert (options["height"], options["gravity"], options["wind"]) == (0.0, 0.0, (4.0, 0.0, 0.0))
 
 

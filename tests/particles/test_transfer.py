@@ -46,8 +46,10 @@ def run_wrong(*words: object, code: int = 2) -> str:
 
 
 def write_points(path: Path, positions: np.ndarray, names: Iterable[str] = "xyz") -> None:
-    """Write a PLY of points with these fields, all others 0."""
-    rows = np.zeros(len(positions), dtype=[(name, "f4") for name in names])
+    """Write a PLY of points with these fields, of which all others have the row's number."""
+    rows = np.empty(len(positions), dtype=[(name, "f4") for name in names])
+    for name in names:
+        rows[name] = np.arange(len(positions))
     rows["x"], rows["y"], rows["z"] = positions.T
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
 
@@ -91,6 +93,11 @@ def test_gaussians_get_the_material_of_their_voxel(tool, store, true_parts, tmp_
     given = columns(tmp_path / "m.ply", ("material_id", "E", "density", "nu")).T
     np.testing.assert_array_equal(given[0], truth)
     hold_truth(*given)
+    apart = np.linalg.norm((positions + 0.5) * 64 % 1 - 0.5, axis=1)
+    np.testing.assert_allclose(
+        columns(tmp_path / "m.ply", ["conf"])[:, 0], 1 - apart / 2, atol=1e-5
+    )
+    assert read_particles(tmp_path / "s.ply").axes == "slat"
 
 
 @pytest.mark.parametrize(("axes", "turn"), [
@@ -157,6 +164,10 @@ def test_particles_that_are_far_are_told_or_an_error(store, true_parts, tmp_path
     np.save(tmp_path / "p.npy", positions)
     told = commands.run("transfer", *words, "-q").stderr
     assert "300 of 900 particles have no voxel" in told and "read with --axes slat" in told
+    write_points(tmp_path / "g.ply", positions, GAUSSIAN)
+    run(tmp_path / "g.ply", *words[1:], "--axes", "slat", "--far", "drop")
+    kept = columns(tmp_path / "m.ply", ["rot_3"])[:, 0]
+    np.testing.assert_array_equal(kept, np.flatnonzero(np.arange(900) % 3))
 
 
 @pytest.mark.parametrize(("names", "reach", "sign"), [
@@ -232,6 +243,7 @@ def test_nearest_is_nearest_by_brute_force(side):
     dropped = transfer(points, field, max_distance=6.0, far="drop")
     np.testing.assert_array_equal(dropped.rows, np.flatnonzero(~far))
     np.testing.assert_array_equal(dropped.properties, result.properties[~far])
+    np.testing.assert_array_equal(dropped.distance, result.distance[~far])
 
 
 def test_grid_reaches_inside_the_object(store, mixed, tmp_path):

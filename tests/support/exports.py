@@ -27,3 +27,9 @@ def hold_truth(
         here = np.asarray(material) == number
         for column, value in zip((modulus, density, ratio), values, strict=True):
             np.testing.assert_allclose(column[here], value, rtol=1e-4)
+
+
+def hold_colours(material: np.ndarray, colours: np.ndarray) -> None:
+    """Hold colours (N, 3), of 0 to 255, to those of jelly and metal in every picture."""
+    for number, shown in ((JELLY[0], (0x5A, 0x9A, 0x5A)), (METAL[0], (0x43, 0x27, 0xAC))):
+        assert (colours[material == number] == shown).all()
