@@ -357,6 +357,11 @@ def test_on_its_own_grid_a_method_scores_as_by_pixie_s_code(case, form):
     np.testing.assert_allclose(list(found.spreads.values()), errors * factor, atol=1e-6)
 
 
+def test_the_grids_of_the_labels_have_no_error_also_beyond_the_ranges(case):
+    found = compared(case, case.parameters.pixieverse.root).methods["m, own grid"].means
+    np.testing.assert_allclose(list(found.values()), [0, 0, 0, 0, 1], atol=1e-6)
+
+
 def test_at_slat_voxels_the_nearest_annotated_voxel_is_looked_up(case):
     store, rows = open_store(case.store), []
     for index, name in enumerate(NAMES):

@@ -400,21 +400,31 @@ def test_scores_of_many_classes_are_read(tmp_path):
             read("b")
 
 
-def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equal_ones():
+@pytest.mark.parametrize("side", [48, 96, 256])
+def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equal_ones(side):
     rng = np.random.default_rng(0)
     voxels = np.unique(rng.integers(0, 24, (9000, 3)), axis=0)
     material = rng.integers(0, 254, 6)[rng.integers(0, 6, len(voxels))]
     values = rng.uniform(0.1, 0.4, (len(voxels), 3))
     field = field_of_voxels(
-        "here", voxels, values, resolution=256, material=material, classes=254, table=PROPERTIES
+        "here", voxels, values, resolution=side, material=material, classes=254, table=PROPERTIES
     )
     for place, own, properties in zip(field.voxels, field.material, field.properties, strict=True):
-        inside = (voxels // 4 == place).all(axis=1)
+        inside = (np.floor((voxels + 0.5) * 64 / side) == place).all(axis=1)
+        if side < 64:  # A cell takes the voxel at its centre.
+            inside = (np.floor((place + 0.5) * side / 64) == voxels).all(axis=1)
         winner = np.bincount(material[inside]).argmax()
         assert own == winner
         chosen = values[inside & (material == winner)]
         expected = [*(10 ** np.log10(chosen[:, :2]).mean(axis=0)), chosen[:, 2].mean()]
         np.testing.assert_allclose(properties, expected, rtol=1e-5)
+
+
+def test_a_point_without_usable_values_is_occupied_and_the_end_is_of_the_last_cell():
+    values = np.array([[1e5, 1e3, 0.3], [np.nan, 1e3, 0.3]])
+    field = field_of_voxels("here", np.array([[0.5] * 3, [0.0] * 3]), values, max_unphysical=0.5)
+    assert field.voxels.tolist() == [[63] * 3]
+    assert np.argwhere(field.occupancy).tolist() == [[32] * 3, [63] * 3]
 
 
 def test_each_class_has_a_colour_of_its_own():

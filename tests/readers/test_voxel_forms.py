@@ -60,7 +60,7 @@ def rows_of(count: int, side: int = 64) -> dict[str, np.ndarray]:
 def write_vomp(folder: Path, rows: dict[str, np.ndarray]) -> None:
     """Write a file of VoMP's dataset by hand: rows of corners in [-0.5, 0.5) and SI values."""
     row = "f4,f4,f4,f4,f4,f4,U32"
-    corners = (rows["voxels"] * 0.015625 - 0.5).T
+    corners = (rows["voxels"] * 0.015625 - 0.5 - 1e-6).T  # as rounding may leave them
     materials = [rows[name] for name in ("youngs_modulus", "poissons_ratio", "density")]
     data = np.rec.fromarrays([*corners, *materials, np.full(len(rows["voxels"]), "seat")], row)
     data.dtype.names = ("x", "y", "z", "youngs_modulus", "poissons_ratio", "density", "segment_id")
@@ -188,6 +188,8 @@ def test_a_known_property_in_another_unit_is_refused(root):
 def test_rows_and_voxels_of_physxnet_belong_together(tmp_path):
     rows, root = rows_of(500), tmp_path / "physx"
     sources.write_physxnet(root, "a", rows["voxels"], rows["density"])
+    as_stated = field_at(root, "physxnet", density="kg/m^3").properties[:, 0]
+    np.testing.assert_allclose(np.sort(as_stated), np.sort(rows["density"]) / 1000, rtol=1e-6)
     np.save(root / "property" / "a2.npy", np.ones((499, 14)))
     refused(root, r"has 499 rows; expected 500, a row a vertex of a\.ply", "physxnet")
     (root / "voxels" / "a.ply").unlink()
@@ -466,6 +468,9 @@ def test_units_may_be_stated_in_the_definition(tmp_path):
     stuff = {"density": 7800, "Young's Modulus (GPa)": 200_000, "Poisson's Ratio": 0.29}
     root = write_object(tmp_path, [(stuff, cuboid(*CUBE))])
     field = field_at(root, "parts", youngs_modulus="MPa", density="kg/m^3")
+    np.testing.assert_allclose(field.properties[0], [2e11, 7800, 0.29])
+    stuff |= {"density": "7800 kg/m^3", "Young's Modulus (GPa)": "200 GPa"}
+    field = field_at(write_object(tmp_path / "texts", [(stuff, cuboid(*CUBE))]), "parts")
     np.testing.assert_allclose(field.properties[0], [2e11, 7800, 0.29])
     # A unit behind a number is another statement.
     root = write_object(tmp_path / "both", [(HANDLE, cuboid(*CUBE))])
