@@ -144,12 +144,17 @@ class Storage:
         """Words for a message if there is nothing at the place: how far the path leads."""
         if self.local is None:
             return "does not exist"
-        above = next(path for path in self.local.absolute().parents if path.is_dir())
-        entries = sorted(islice(above.iterdir(), 1000))
-        wanted = self.local.absolute().relative_to(above).parts[0]
-        if close := difflib.get_close_matches(wanted, [path.name for path in entries], n=1):
+        try:
+            above = next(path for path in self.local.absolute().parents if path.is_dir())
+            entries = sorted(islice(above.iterdir(), 1000))
+            folders = [path.name for path in entries if path.is_dir() and path.name[0] != "."]
+        except OSError as error:
+            return f"cannot be looked for: {error.filename}: {error.strerror}"
+        wanted, names = self.local.absolute().relative_to(above).parts[0], [e.name for e in entries]
+        if wanted in names:
+            return f"does not exist; {above / wanted} is no folder"
+        if close := difflib.get_close_matches(wanted, names, n=1):
             return f"does not exist; did you mean {above / close[0]}?"
-        folders = (path.name for path in entries if path.is_dir() and path.name[0] != ".")
         held = first_of(folders, 5) or "(none)"
         return f"does not exist; {above} does, and holds the folders {held}"
 
