@@ -191,9 +191,10 @@ def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
 
 def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
     """Yield common mistakes: units of one or both columns, ids of classes, and swapped columns."""
-    if scaled := {name: unit for name, unit in vars(units).items() if FACTORS.get(unit, 1.0) != 1}:
-        words = "ones in SI units, though other units are stated"
-        yield Mistake(words, f"leave {in_toml(scaled)} out", partial(_unscaled, units))
+    scaled = {name: unit for name, unit in vars(units).items() if FACTORS.get(unit, 1.0) != 1}
+    for wrong in [{name: unit} for name, unit in scaled.items()] + [scaled] * (len(scaled) > 1):
+        words = f"ones in SI units, not in the stated {' and '.join(wrong.values())}"
+        yield Mistake(words, f"leave {in_toml(wrong)} out", partial(_unscaled, Units(**wrong)))
     named = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
              "density": ("g/cm^3", f"{LOG10}kg/m^3")}  # fmt: skip
     choices = []

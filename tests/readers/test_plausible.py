@@ -185,6 +185,13 @@ def test_units_that_are_stated_for_values_in_si_units_are_to_be_left_out(read, s
     assert f'leave units = {{ {name} = "{unit}"' in str(error.value)
 
 
+def test_of_two_stated_units_only_the_wrong_one_is_to_be_left_out(read):
+    units = Units(youngs_modulus="MPa", density="g/cm^3")
+    with pytest.raises(InputError, match="not in the stated g/cm") as error:
+        read((STATIONARY, 1e4, 600, 0.3), units=units)
+    assert 'leave units = { density = "g/cm^3" } out' in str(error.value)
+
+
 def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(read):
     assert "is it in MPa?" in told(read((STATIONARY, 5e4, 2700, 0.25)))[0]
     field = read(*[(JELLY, 2e6, 930, 0.49)] * 4, (METAL, 200, 7850, 0.3))
