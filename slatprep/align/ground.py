@@ -47,8 +47,8 @@ GROUND_GAIN = 0.05
 """Rise of the score without a layer above which the layer is ground."""
 
 WIDTH, WIDE = 0.3, 1.2
-"""Rise of the score that counts as much as ground that is wider by the width of what stands on it,
-and the width from which on more does not count. Ground is seldom the narrower one."""
+"""Weight of a layer's width, over that of what stands on it, beside the rise of the score, and the
+ratio above which it adds no more. Ground is seldom the narrower one."""
 
 
 def find_layers(surface: Surface) -> list[Ground]:
@@ -98,7 +98,10 @@ def gain(without: Alignment, found: Alignment) -> float:
 def worth(
     rise: float, layer: Ground, occupancy: NDArray[np.bool_], solid: NDArray[np.bool_]
 ) -> float:
-    """Return what ranks layers: the gain, and the width of what `solid` leaves of `occupancy`."""
+    """Return the rank of a layer: the rise of the score without it, and its weighted width.
+
+    The layer is what `occupancy` has and `solid` lacks.
+    """
     left_out, standing = (_width(voxels, layer.normal) for voxels in (occupancy & ~solid, solid))
     return rise + WIDTH * min(left_out / max(standing, 1.0), WIDE)
 

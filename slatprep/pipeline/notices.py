@@ -28,8 +28,6 @@ _WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0
 _BESIDE_PIXIE = 0.5
 """Decades by which PixieVerse itself may exceed Pixie's published ranges."""
 
-_NAMED = 3
-
 _MOVED = 1e-6
 """Largest move of an end without a notice, as a share of its range: rounding moves it less."""
 
@@ -201,7 +199,7 @@ def wild_ranges(
 
     `extents` are (A, P, 2) in mapped units. With two objects, either may be the wrong one.
     """
-    if len(set(objects)) < _NAMED:
+    if len(set(objects)) < 3:
         return
     usual = {one.name: one for one in PIXIE_RANGES.ranges}
     for column, span in enumerate(normalization.ranges):
