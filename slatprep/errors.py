@@ -77,6 +77,10 @@ def first_of(names: Iterable[str], most: int = 3, number: int | None = None) -> 
 
     >>> first_of(["cup", "ant", "fox"], 2)
     'cup, ant and 1 more'
+    >>> first_of(["cup", "ant"], 2)
+    'cup, ant'
+    >>> first_of(["cup", "ant"], 2, number=9)
+    'cup, ant and 7 more'
     """
     names = list(names)
     more = (len(names) if number is None else number) - most

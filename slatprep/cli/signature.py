@@ -192,10 +192,11 @@ class SomePath(click.Path):
         """Return the value as a path."""
         if value == "":
             self.fail("is empty; expected a path", parameter, context)
-        if self.exists and not os.path.lexists(value):
+        if self.exists and not (path := Path(value)).exists():
             from slatprep.storage.place import storage_of
 
-            self.fail(f"{value} {storage_of(Path(value)).absent}", parameter, context)
+            fault = storage_of(path).absent(files=self.file_okay, folders=self.dir_okay)
+            self.fail(f"{click.format_filename(value)} {fault}", parameter, context)
         return super().convert(value, parameter, context)
 
 

@@ -89,14 +89,14 @@ def discover(
     try:
         for source in sources:
             if not source.root.is_dir() and not is_archive(source.root.name):
-                missing = storage_of(source.root).absent
+                missing = storage_of(source.root).absent()
                 absent = "is another file" if source.root.exists() else missing
                 raise ConfigError(
                     f"{source.root}: {absent}; expected PixieVerse's folder or an archive of it"
                 )
         if not slat.root.exists():
             raise ConfigError(
-                f"{slat.root}: {storage_of(slat.root).absent}; expected a folder of SLATs or an "
+                f"{slat.root}: {storage_of(slat.root).absent()}; expected a folder of SLATs or an "
                 "HDF5 file"
             )
         folder = slat.root.parent if slat.root.is_file() else slat.root

@@ -77,7 +77,7 @@ _USUAL = {
 }
 _USUAL_MODULUS, _USUAL_DENSITY = (3e2, 3e11), (15.0, 9_000.0)
 
-_UNSTATED = Units()
+_UNSTATED, _SI = Units(), {one.name: one.unit for one in PROPERTIES}
 
 
 class Part(NamedTuple):
@@ -191,29 +191,24 @@ def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
 
 def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
     """Yield common mistakes: units of one or both columns, ids of classes, and swapped columns."""
-    scaled = {name: unit for name, unit in vars(units).items() if FACTORS.get(unit, 1.0) != 1}
-    for wrong in [{name: unit} for name, unit in scaled.items()] + [scaled] * (len(scaled) > 1):
-        words = f"ones in SI units, not in the stated {' and '.join(wrong.values())}"
-        yield Mistake(words, f"leave {in_toml(wrong)} out", partial(_unscaled, Units(**wrong)))
-    named = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
+    known = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
              "density": ("g/cm^3", f"{LOG10}kg/m^3")}  # fmt: skip
-    choices = []
-    for k, (name, known) in enumerate(named.items()):
+    choices: list[list[str]] = []
+    for k, (name, others) in enumerate(known.items()):
+        stated = units.of(name)
         lacking = all(math.isnan(part.values[k]) for part in parts)
-        choices.append([""] if lacking or units.of(name) else ["", *known])
+        fixed = lacking or (stated and FACTORS.get(stated, 1.0) == 1)
+        choices.append([stated] if fixed else list(dict.fromkeys([stated, "", *others])))
     # Among pairs of units, two logarithms are the likeliest.
     pairs = sorted(
         product(*choices),
-        key=lambda pair: (sum(map(bool, pair)), not all(one.startswith(LOG10) for one in pair)),
+        key=lambda pair: (
+            sum(unit != units.of(name) for name, unit in zip(known, pair, strict=True)),
+            not all(one.startswith(LOG10) for one in pair),
+        ),
     )
     for pair in pairs[1:]:
-        chosen = dict(zip(named, pair, strict=True))
-        words = " and ".join(unit for unit in pair if unit)
-        setting = (
-            f"or say {in_toml(chosen)} in [pixieverse] of the dataset definition (a TOML file "
-            "given with --config)"
-        )
-        yield Mistake(words, setting, partial(_scaled, pair))
+        yield _other_units(dict(zip(known, pair, strict=True)), units)
     if {part.name for part in parts} & LIGHTEST.keys():
         yield Mistake(
             "classes of PhysGaussian's table, where 3 is foam, 4 is snow and 5 is plasticine",
@@ -236,18 +231,34 @@ def in_toml(units: Mapping[str, str]) -> str:
     return given and f"units = {{ {given} }}"
 
 
-def _scaled(units: Sequence[str], part: Part) -> Part:
-    """Convert modulus and density from these units to SI units."""
-    modulus, density = map(float, map(to_si, (part.modulus, part.density), units))
-    return part._replace(modulus=modulus, density=density)
+def _other_units(truly: Mapping[str, str], stated: Units) -> Mistake:
+    """Return the mistake that values are `truly` in these units, by property; empty for SI."""
+    wrong = {name: unit for name, unit in truly.items() if unit != stated.of(name)}
+    revoked = {name: stated.of(name) for name in wrong if stated.of(name)}
+    words = " and ".join(unit or _SI[name] for name, unit in wrong.items())
+    if revoked:
+        words += f", not the stated {' and '.join(revoked.values())}"
+    settings = []
+    if in_si := in_toml({name: unit for name, unit in revoked.items() if not truly[name]}):
+        settings.append(f"leave {in_si} out if they are in SI units")
+    if others := in_toml(wrong):
+        settings.append(
+            f"or say {others} in [pixieverse] of the dataset definition (a TOML file "
+            "given with --config)"
+        )
+    return Mistake(words, ", ".join(settings), partial(_scaled, stated, tuple(truly.values())))
 
 
-def _unscaled(units: Units, part: Part) -> Part:
-    """Return modulus and density as they were in the file, where stated units only scale them."""
-    return part._replace(
-        modulus=part.modulus / FACTORS.get(units.youngs_modulus, 1.0),
-        density=part.density / FACTORS.get(units.density, 1.0),
+def _scaled(stated: Units, truly: Sequence[str], part: Part) -> Part:
+    """Convert modulus and density from the true units to SI units, not from the stated ones."""
+    given = (
+        value / FACTORS.get(unit, 1.0)
+        for value, unit in zip(
+            (part.modulus, part.density), (stated.youngs_modulus, stated.density), strict=True
+        )
     )
+    modulus, density = map(float, map(to_si, given, truly))
+    return part._replace(modulus=modulus, density=density)
 
 
 def _moved(order: Sequence[int], part: Part) -> Part:

@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, TypeGuard
 
-from slatprep.errors import ConfigError, InputError, StoreError, first_of
+from slatprep.errors import ConfigError, InputError, StoreError
 from slatprep.storage.archives import Archive
 from slatprep.storage.atomic import staged, staged_apart
 from slatprep.storage.cache import cached_file, copied_version, folder_for
@@ -139,24 +139,30 @@ class Storage:
         listing = self.listing()
         return list(listing.of_folder("", folders=False)), list(listing.of_folder("", folders=True))
 
-    @property
-    def absent(self) -> str:
-        """Words for a message if there is nothing at the place: how far the path leads."""
-        if self.local is None:
-            return "does not exist"
+    def absent(self, *, files: bool = True, folders: bool = True) -> str:
+        """Words for a message if there is nothing at the place: how far the path leads.
+
+        `files` and `folders` tell which of them the user may have meant.
+        """
         try:
-            above = next(path for path in self.local.absolute().parents if path.is_dir())
-            entries = sorted(islice(above.iterdir(), 1000))
-            folders = [path.name for path in entries if path.is_dir() and path.name[0] != "."]
+            path = self._path.absolute()
+            first = next((one for one in reversed(path.parents) if not one.is_dir()), path)
+            beside = sorted(islice(first.parent.iterdir(), 1000))
+            if first.exists():
+                return f"does not exist; {first} is no folder"
+            if first.is_symlink():
+                return f"does not exist; {first} is a link that leads nowhere ({first.readlink()})"
+            seen = [one for one in beside if one.name[0] != "."]
+            held = [one.name for one in seen if (one.is_dir() if folders else one.is_file())]
+            meant = held + [one.name for one in seen if folders and files and one.is_file()]
         except OSError as error:
-            return f"cannot be looked for: {error.filename}: {error.strerror}"
-        wanted, names = self.local.absolute().relative_to(above).parts[0], [e.name for e in entries]
-        if wanted in names:
-            return f"does not exist; {above / wanted} is no folder"
-        if close := difflib.get_close_matches(wanted, names, n=1):
-            return f"does not exist; did you mean {above / close[0]}?"
-        held = first_of(folders, 5) or "(none)"
-        return f"does not exist; {above} does, and holds the folders {held}"
+            return f"cannot be looked for: {error.filename or 'working folder'}: {error.strerror}"
+        if close := difflib.get_close_matches(first.name, meant, n=1):
+            return f"does not exist; did you mean {first.with_name(close[0])}?"
+        # A count could be wrong: the listing may have been cut short.
+        told = ", ".join(held[:5]) + " and others" * (len(held) > 5) or "(none)"
+        kind = "folders" if folders else "files"
+        return f"does not exist; {first.parent} does, and holds the {kind} {told}"
 
     def archives(self, names: Iterable[str], wanted: tuple[str, ...]) -> list[Archive]:
         """Return archives that lie in the place, by name; only members like `wanted` matter.
@@ -282,10 +288,9 @@ class _ObjectStore(Storage):
     def listing(self) -> Listing:
         return RemoteListing(list_objects(self.place))
 
-    @property
-    def absent(self) -> str:
+    def absent(self, *, files: bool = True, folders: bool = True) -> str:
         if self.place.protocol != "hf":
-            return super().absent
+            return "does not exist"
         return "is not on the hub, or not for everybody: check its name, and set HF_TOKEN"
 
     def names(self) -> tuple[list[str], list[str]]:

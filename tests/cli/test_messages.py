@@ -112,7 +112,10 @@ def test_a_number_is_told_with_its_asset_and_no_asset_is_wrong_use(words, store,
     ("build-store --slat SLAT --out NEW --pixieverse ROOT/absent", 2,
      "ROOT does, and holds the folders "),
     ("info ROOT/pixeverse", 2, "ROOT/pixeverse does not exist; did you mean ROOT/pixieverse?"),
-    ("list STORE/zarr.jsn", 2, "did you mean STORE/zarr.json?"),
+    ("build-store --config STORE/zarr.jsn", 2, "did you mean STORE/zarr.json?"),
+    ("build-store --config ROOT/pixeverse", 2, "ROOT does, and holds the files "),
+    ("list STORE/zarr.jsn", 2, "STORE does, and holds the folders asset, "),
+    ("info ROOT/.pixieverse", 2, "did you mean ROOT/pixieverse?"),
 ])  # fmt: skip
 def test_what_ends_a_command_is_told_as_json(words, code, said, store, mixed, tmp_path):
     places = {"STORE": store, "FOLDER": tmp_path, "NEW": tmp_path / "new"}
@@ -134,6 +137,31 @@ def test_a_lost_file_of_a_column_is_named_and_one_never_written_is_fine(copy):
     for words in (("info",), ("list",), ("stats",), ("diff", copy)):
         told = refused(words[0], copy, *words[1:], code=1)
         assert f"{copy}/asset/verdict/c/0: is missing (was the store replaced? Open" in told
+
+
+def test_what_is_absent_is_told_by_how_far_its_path_leads(tmp_path, monkeypatch):
+    (tmp_path / "dang").symlink_to("nowhere")
+    (tmp_path / ".cups").mkdir()
+    nowhere = "is a link that leads nowhere (nowhere)"
+    for path, said in [
+        ("dang", f"{tmp_path / 'dang'} does not exist; {tmp_path / 'dang'} {nowhere}"),
+        ("dang/x", f"{tmp_path / 'dang/x'} does not exist; {tmp_path / 'dang'} {nowhere}"),
+        ("dung", f"{tmp_path} does, and holds the folders (none)"),
+        ("cups", f"{tmp_path} does, and holds the folders (none)"),
+        ("\udcff", "'\ufffd' does not exist"),
+    ]:
+        error = " ".join(run("info", str(tmp_path / path), code=2).stderr.split())
+        assert said.replace("'\ufffd'", str(tmp_path / "\ufffd")) in error
+    for k in range(1000):
+        (tmp_path / f"{k:03}").mkdir()
+    assert f"{tmp_path} does, and holds the folders 000, 001, " in (
+        told := " ".join(run("info", str(tmp_path / "absent"), code=2).stderr.split())
+    )
+    assert told.endswith(" and others")
+    (gone := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert "cannot be looked for" in run("info", "x", code=2).stderr
 
 
 def test_a_misspelt_command_is_told_with_the_one_meant():

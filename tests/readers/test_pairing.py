@@ -427,9 +427,10 @@ def test_a_folder_on_the_way_to_ids_that_cannot_be_listed_is_named(find, tmp_pat
 def test_a_place_below_what_cannot_be_listed_or_is_a_file_says_so(tmp_path):
     (tmp_path / "file").touch()
     (locked := tmp_path / "locked").mkdir()
-    assert storage_of(tmp_path / "file/x").absent == f"does not exist; {tmp_path}/file is no folder"
+    below_file = storage_of(tmp_path / "file/x").absent()
+    assert below_file == f"does not exist; {tmp_path}/file is no folder"
     with unlistable(locked):
-        told = storage_of(locked / "x").absent
+        told = storage_of(locked / "x").absent()
     assert told == f"cannot be looked for: {locked}: Permission denied"
 
 

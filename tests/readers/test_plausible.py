@@ -174,22 +174,30 @@ def test_what_is_stated_is_not_asked_about(read):
     assert "Such keys hold for all objects: where this one alone is so" in str(error.value)
 
 
-@pytest.mark.parametrize("stated", [
-    {"youngs_modulus": "GPa"}, {"density": "g/cm^3"},
-    {"youngs_modulus": "MPa", "density": "g/cm^3"},
+LEAVE_E, LEAVE_RHO = (f'leave units = {{ {one} }} out if' for one in (
+    'youngs_modulus = "GPa"', 'density = "g/cm^3"'))  # fmt: skip
+
+
+@pytest.mark.parametrize(("part", "stated", "guess", "advice"), [
+    ((METAL, 2e11, 7850, 0.3), {"youngs_modulus": "GPa"}, "Pa, not the stated GPa: ", LEAVE_E),
+    ((METAL, 2e11, 7850, 0.3), {"density": "g/cm^3"},
+     "kg/m^3, not the stated g/cm^3: ", LEAVE_RHO),
+    ((METAL, 2e11, 7850, 0.3), {"youngs_modulus": "MPa", "density": "g/cm^3"},
+     "Pa and kg/m^3, not the stated MPa and g/cm^3: ",
+     'leave units = { youngs_modulus = "MPa", density = "g/cm^3" } out if'),
+    # Oak with E in MPa: without the unit E would be a million times too small, and plausible.
+    ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "MPa", "density": "g/cm^3"},
+     "kg/m^3, not the stated g/cm^3 (or ", LEAVE_RHO),
+    ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "GPa"},
+     "Pa, not the stated GPa (or MPa, not the stated GPa, ", f"{LEAVE_E} they are in SI units"),
+    ((METAL, 2e5, 7850, 0.3), {"youngs_modulus": "GPa"},
+     "MPa, not the stated GPa (or kPa", 'order; or say units = { youngs_modulus = "MPa" } in'),
 ])  # fmt: skip
-def test_units_that_are_stated_for_values_in_si_units_are_to_be_left_out(read, stated):
-    with pytest.raises(InputError, match="look like ones in SI units") as error:
-        read((METAL, 2e11, 7850, 0.3), units=Units(**stated))
-    ((name, unit), *_) = stated.items()
-    assert f'leave units = {{ {name} = "{unit}"' in str(error.value)
-
-
-def test_of_two_stated_units_only_the_wrong_one_is_to_be_left_out(read):
-    units = Units(youngs_modulus="MPa", density="g/cm^3")
-    with pytest.raises(InputError, match="not in the stated g/cm") as error:
-        read((STATIONARY, 1e4, 600, 0.3), units=units)
-    assert 'leave units = { density = "g/cm^3" } out' in str(error.value)
+def test_of_stated_units_the_wrong_one_is_named(read, part, stated, guess, advice):
+    with pytest.raises(InputError) as error:
+        read(part, units=Units(**stated))
+    assert f"the values look like {guess}" in str(error.value)
+    assert advice in str(error.value)
 
 
 def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(read):
