@@ -19,16 +19,6 @@ from slatprep.storage.place import storage_of
 if TYPE_CHECKING:
     from slatprep.store import Store
 
-# The formats of each option; giving it with another format is an error.
-_ONLY_FOR = {
-    "points": ("ply", "voxel_data", "usd"),
-    "frame": ("ply",),
-    "shard_size": ("webdataset",),
-    "latent_model": ("npz",),
-    "size": ("usd",),
-    "materials": ("usd",),
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class FormatOptions:
@@ -61,11 +51,13 @@ class FormatOptions:
 
     def of(self, kind: str) -> dict[str, Any]:
         """Return the options that were given; refuse an option of another format."""
+        from slatprep.export import FORMATS
+
         given = {name: value for name, value in vars(self).items() if value is not None}
         for name in given:
-            if kind not in _ONLY_FOR[name]:
+            if name not in FORMATS[kind].options:
                 flag = f"--{name.replace('_', '-')}"
-                formats = " or ".join(_ONLY_FOR[name])
+                formats = " or ".join(one for one in FORMATS if name in FORMATS[one].options)
                 raise ConfigError(f"{flag} is for --format {formats}, not {kind}")
         return given
 

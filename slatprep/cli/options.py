@@ -16,7 +16,7 @@ import click
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, NewPath, SomePath
 from slatprep.errors import amount, first_of, tally
-from slatprep.storage.place import place_of, storage_of
+from slatprep.storage.place import is_place, place_of, storage_of
 
 if TYPE_CHECKING:
     from slatprep.parameters import BuildParameters
@@ -421,7 +421,7 @@ class SourceOptions:
             group, key = name.split(".")
             if key == "shares":
                 value = dataclasses.astuple(_shares(value))
-            elif not isinstance(value, str):
+            elif is_place(value):
                 value = str(value.absolute())
             given.setdefault(group, {})[key] = value
         for name, chosen in passes.items():

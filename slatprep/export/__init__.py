@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, NamedTuple
 
 from slatprep.errors import require_one_of
 from slatprep.export import target
@@ -31,19 +31,27 @@ from slatprep.workers.local import run_unordered
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
 
-FORMATS = {
-    "ply": "slatprep.export.ply:writer",
-    "hdf5": "slatprep.export.hdf5:writer",
-    "webdataset": "slatprep.export.npz:webdataset",
-    "npz": "slatprep.export.npz:trellis",
-    "voxel_data": "slatprep.export.npz:voxel_data",
-    "usd": "slatprep.export.usd:writer",
-}
-"""Name of each format and its function; to add a format, add its line here.
 
-The function takes the open store, the ids of the exported assets and the `ExportOptions`, and
-returns a `Writer`.
-"""
+class Format(NamedTuple):
+    """A format: where its function lies, and the fields of `ExportOptions` that it reads.
+
+    The function takes the open store, the ids of the exported assets and the `ExportOptions`, and
+    returns a `Writer`.
+    """
+
+    writer: str
+    options: tuple[str, ...] = ()
+
+
+FORMATS = {
+    "ply": Format("slatprep.export.ply:writer", ("points", "frame")),
+    "hdf5": Format("slatprep.export.hdf5:writer"),
+    "webdataset": Format("slatprep.export.npz:webdataset", ("shard_size",)),
+    "npz": Format("slatprep.export.npz:trellis", ("latent_model",)),
+    "voxel_data": Format("slatprep.export.npz:voxel_data", ("points",)),
+    "usd": Format("slatprep.export.usd:writer", ("points", "size", "materials")),
+}
+"""Each format by its name; to add a format, add its line here."""
 
 _REPEATED = ("manifest", "resolution", "material_classes", "property_columns", "property_units",
              "latents", "normalization")  # fmt: skip
@@ -87,8 +95,8 @@ def export_store(
     out : str or Path
         The file (``hdf5``) or folder (all others) to write. The new export replaces an old one of
         the same format when complete; other files stay.
-    format : {"ply", "hdf5", "webdataset", "npz", "voxel_data", "usd"}
-        The format, see docs/export.md.
+    format : str
+        The format, one of `FORMATS`; see docs/export.md.
     assets : str, or sequence of str or int
         Ids, beginnings of ids, or numbers; empty takes all.
     verdicts : str or sequence of str, optional
@@ -123,7 +131,7 @@ def export_store(
         verdicts = () if assets else USABLE
     ids = choose_ids(opened, assets, verdicts)
     tell = progress or (lambda done, total: None)
-    writer: Writer = resolve_name(FORMATS[format])(opened, ids, options)
+    writer: Writer = resolve_name(FORMATS[format].writer)(opened, ids, options)
     about = _about(opened, format)
     clipped = clipped_values(opened, ids, writer.points)
     entries: list[_Entry] = []

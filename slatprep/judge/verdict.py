@@ -249,12 +249,13 @@ def verdict_of(
 def _doubts(quality: Quality, judgement: Judgement, wrong: bool) -> list[str]:
     """Return the reasons for a low confidence, by object and placement, the worse one first."""
     from slatprep.judge.confidence import causes_of_doubt
+    from slatprep.judge.evidence import FIGURES
 
     limits, sure = THRESHOLDS, ("perhaps", "probably")
     same_object, right_placement = judgement.same_object, judgement.right_placement
     good = f"(good needs {limits.good_confidence:.0%} for object and placement together)"
     because = ""
-    if judgement.evidence:
+    if len(judgement.evidence) == len(FIGURES):  # An older store may hold other figures.
         because = f": {_WORDS[next(iter(causes_of_doubt(np.array(judgement.evidence))))]}"
     another = sure[same_object < limits.failed_confidence]
     of_object = (

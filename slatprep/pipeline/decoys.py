@@ -18,6 +18,7 @@ import orjson
 from numpy.typing import NDArray
 
 from slatprep.errors import SlatprepError, StoreError
+from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.pipeline.measured import (
     LEAST_TOLD,
@@ -195,8 +196,8 @@ def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.fl
             raise StoreError(
                 f"{store.path}: the record of {asset_id} cannot be read; run `slatprep verify`"
             ) from None
-    if len({one.shape for one in evidence}) != 1 or not evidence[0].size:
-        raise StoreError(f"{store.path}: its records hold no evidence; build it again")
+    if any(one.shape != (len(FIGURES),) for one in evidence):
+        raise StoreError(f"{store.path}: its records hold other evidence; build it again")
     return keys, grids, np.array(evidence)
 
 

@@ -20,6 +20,7 @@ from slatprep.errors import InputError, SlatprepError
 from slatprep.geometry.frames import split_transform
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
+from slatprep.readers.plausible import coarse_places
 from slatprep.readers.values import require_plausible
 from slatprep.records.json_types import Count
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
@@ -127,9 +128,13 @@ class ForeignSource(_Foreign):
             yield found
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
-        """Read a field, check it, and compare its values with those of known materials."""
+        """Read a field, check it, and compare its values with those of known materials.
+
+        The adapter sees no stated units, so that values are converted once: here.
+        """
+        given = replace(pair, roots=replace(pair.roots, units=records.Units(), plausibility="off"))
         with self._blamed():
-            field: records.MaterialField = self.adapter.read(pair, max_unphysical)
+            field: records.MaterialField = self.adapter.read(given, max_unphysical)
             self._require(
                 isinstance(field, records.MaterialField), f"{type(field).__name__} as a field"
             )
@@ -166,6 +171,8 @@ class ForeignSource(_Foreign):
         where, classes = pair.grid or pair.roots.pixieverse, contents.classes
         values, material = field.properties.copy(), field.material if field.classified else None
         told = require_plausible(where, values, material, table, classes, pair.roots)
+        if pair.roots.plausibility != "off":
+            told += coarse_places(field.voxels, side, f"make the voxels of a grid of {side}^3")
         return replace(field, properties=values, warnings=(*field.warnings, *told))
 
 

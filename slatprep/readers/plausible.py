@@ -251,14 +251,9 @@ def _other_units(truly: Mapping[str, str], stated: Units) -> Mistake:
 
 def _scaled(stated: Units, truly: Sequence[str], part: Part) -> Part:
     """Convert modulus and density from the true units to SI units, not from the stated ones."""
-    given = (
-        value / FACTORS.get(unit, 1.0)
-        for value, unit in zip(
-            (part.modulus, part.density), (stated.youngs_modulus, stated.density), strict=True
-        )
-    )
-    modulus, density = map(float, map(to_si, given, truly))
-    return part._replace(modulus=modulus, density=density)
+    modulus = to_si(part.modulus / FACTORS.get(stated.youngs_modulus, 1.0), truly[0])
+    density = to_si(part.density / FACTORS.get(stated.density, 1.0), truly[1])
+    return part._replace(modulus=float(modulus), density=float(density))
 
 
 def _moved(order: Sequence[int], part: Part) -> Part:

@@ -23,6 +23,7 @@ def field_of_voxels(
     voxels: NDArray[Any],
     properties: NDArray[Any],
     *,
+    roots: records.SourceRoots,
     resolution: int = records.RESOLUTION,
     material: NDArray[Any] | None = None,
     classes: int = records.BACKGROUND,
@@ -31,27 +32,26 @@ def field_of_voxels(
     sources: Sequence[records.SourceFile] = (),
     frame: NDArray[np.float64] | None = None,
     names: Sequence[str] = (),
-    roots: records.SourceRoots | None = None,
     description: str = "",
 ) -> records.MaterialField:
     """Make a field of annotated voxels (K, 3): integers in 0..resolution - 1, or float points.
 
-    Points lie in the unit cube [-0.5, 0.5]^3. `properties` (K, P) are SI values with a column
-    for each entry of `table`. `material` (K,) are class ids, all 0 by default; `classes` counts
-    them, at most 254. Errors call the source `where`.
+    Points lie in the unit cube [-0.5, 0.5]^3. `properties` (K, P) have a column for each entry of
+    `table`, in SI units or in those that `roots`, the pair's, state; these also say how implausible
+    values are treated. `material` (K,) are class ids, all 0 by default; `classes` counts them, at
+    most 254. Errors call the source `where`.
 
     Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
     voxels' most frequent class (the lowest at a tie) and the mean properties of that class's
     voxels. The mean is in log10 for properties that are normalised in log10. InputError if there is
-    no voxel, one is out of range, or too many are unphysical. `names` are the classes' names;
-    `roots` state the units of the values and how implausible ones are treated. If a file
-    `description` states the resolution, an integer voxel may not occur twice with different values.
-    Integer voxels that fill only an eighth of the grid give a warning.
+    no voxel, one is out of range, or too many are unphysical. `names` are the classes' names. If a
+    file `description` states the resolution, an integer voxel may not occur twice with different
+    values. Integer voxels that fill only an eighth of the grid give a warning.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
     whole = np.asarray(voxels).dtype.kind != "f"
-    if whole and (roots is None or roots.plausibility != "off"):
+    if whole and roots.plausibility != "off":
         way = f"say the grid's own resolution in {description}"
         anew = f"make the voxels of a grid of {resolution}^3"
         notes += coarse_places(cells, resolution, way if description else anew)
@@ -68,9 +68,8 @@ def field_of_voxels(
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
-    if roots is not None:
-        labels = None if material is None else own
-        notes += require_plausible(where, values, labels, table, names, roots)
+    own_or_none = None if material is None else own
+    notes += require_plausible(where, values, own_or_none, table, names, roots)
 
     def told(row: int, column: int) -> tuple[str, Any]:
         value = np.asarray(properties)[row, column]

@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import importlib
 import importlib.util
+import inspect
 import json
 import os
 import re
@@ -26,11 +27,18 @@ from support.installed import package
 from support.synthetic import Dataset, make_asset
 
 from slatprep import build_store, load_parameters, open_store
+from slatprep.cli import build
 from slatprep.cli.commands import COMMANDS, slatprep
 from slatprep.cli.export import export
-from slatprep.export import FORMATS
-from slatprep.parameters import BuildParameters
+from slatprep.export import FORMATS, ExportOptions
+from slatprep.parameters import (
+    BuildParameters,
+    NormalizeParameters,
+    PixieverseSource,
+    SlatSource,
+)
 from slatprep.readers import adapters
+from slatprep.readers.splits import Shares
 from slatprep.readers.voxels import _parsed
 from slatprep.store.layout import ARRAYS, MERGED
 from slatprep.store.records import StoredRecords
@@ -253,9 +261,36 @@ def test_each_format_of_export_is_told_of_in_help_and_page():
     page = (ROOT / "docs" / "export.md").read_text("utf-8")
     rows = re.findall(r"^\| `(\w+)` \| a f(?:ile|older)", page, re.M)
     commands = re.findall(r"^slatprep export .*--format (\w+)", page, re.M)
-    assert set(rows) == set(commands) == FORMATS.keys()
-    (kind,) = (one for one in export.params if one.name == "kind")
-    assert set(re.findall(r"(\w+): ", getattr(kind, "help", ""))) == FORMATS.keys()
+    helps = {one.name: getattr(one, "help", "") for one in export.params}
+    assert set(rows) == FORMATS.keys(), "a row of docs/export.md begins with '| `name` | a file'"
+    assert set(commands) == FORMATS.keys(), "docs/export.md has an example of each"
+    assert set(re.findall(r"(\w+): ", helps["kind"])) == FORMATS.keys(), "help of --format"
+    for field in dataclasses.fields(ExportOptions):
+        own = [name for name, one in FORMATS.items() if field.name in one.options]
+        assert helps[field.name].partition(":")[0] == ", ".join(own)
+
+
+@pytest.mark.parametrize(("command", "name", "default"), [
+    (export, "frame", ExportOptions.frame),
+    (export, "shard_size", ExportOptions.shard_size),
+    (export, "materials", ExportOptions.materials),
+    (export, "size", f"{ExportOptions.size:g}"),
+    (build.build_store, "samples", PixieverseSource.samples),
+    (build.build_store, "encoder", SlatSource.encoder),
+    (build.build_store, "ranges", NormalizeParameters.ranges),
+    (build.build_store, "ranges_of", NormalizeParameters.objects),
+    (build.build_store, "split_by", NormalizeParameters.split_by),
+    (build.build_store, "shares", ",".join(map(str, dataclasses.astuple(Shares())))),
+])  # fmt: skip
+def test_a_default_that_help_states_is_that_of_the_parameters(command, name, default):
+    (option,) = (one for one in command.params if one.name == name)
+    assert f"[default: {default}]" in option.help
+
+
+@pytest.mark.parametrize("name", ["decoys", "rehash"])
+def test_a_default_of_the_command_is_that_of_the_function(name):
+    (option,) = (one for one in build.build_store.params if one.name == name)
+    assert option.default == inspect.signature(build_store).parameters[name].default
 
 
 def test_formats_describes_every_array():

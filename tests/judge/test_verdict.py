@@ -32,13 +32,14 @@ def said_of(
     ties: int = 0,
     mirrored: float = math.nan,
     worst: str = "",
+    held: int = len(FIGURES),
     **others: Any,
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """Return the verdict on an alignment with these figures; the one called `worst` is 0."""
+    """Return the verdict on an alignment with these figures; of those `held`, `worst` is 0."""
     figures = FitFigures(1.0, 1.0, 1.0, math.nan, math.nan, (1.0, 1.0, 1.0), 0.0, 0.0)
     figures = replace(figures, mirrored=mirrored)
     alignment = aligned(*[np.eye(4)] * (ties + 1), quality=quality, figures=figures)
-    evidence = tuple(0.0 if name == worst else math.nan for name in FIGURES) if worst else ()
+    evidence = tuple(0.0 if name == worst else math.nan for name in FIGURES[:held]) if worst else ()
     known = Judgement(Ambiguity(ambiguity, (0.0,)), Verdict.GOOD, evidence=evidence, **others)
     return verdict_of(alignment, known, valid)
 
@@ -121,6 +122,9 @@ def test_without_a_cause_none_is_named_and_the_fitness_is():
     _, (first, *fitnesses) = said_of(ROUGH, same_object=0.6, right_placement=1.0)
     assert first.endswith("together)")
     assert len(fitnesses) == 2
+    # So it is of an older store, whose records hold other figures.
+    _, older = said_of(ROUGH, worst="score_slat", held=33, same_object=0.6, right_placement=1.0)
+    assert older == (first, *fitnesses)
     # Of placements the fitness says nothing, as another one fits as well.
     _, reasons = said_of(ROUGH, worst="within_3", same_object=1.0, right_placement=0.6)
     assert len(reasons) == 1

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.commands import document, run
+from support.made_store import edit_record
 from support.trees import copied, tree
 
 from slatprep import Store, StoreError, open_store
@@ -98,6 +99,14 @@ def test_a_disk_that_cannot_be_written_is_told_before_decoys_are_aligned(store, 
     monkeypatch.setattr("os.access", lambda path, mode: mode != os.W_OK)  # As on a read-only disk.
     with pytest.raises(StoreError, match=r"cannot be written to; expected a folder for .*decoys"):
         measure_errors(store)
+
+
+def test_a_store_with_figures_of_another_version_is_told(mixed_build, tmp_path):
+    out = copied(Path(str(mixed_build.store)), tmp_path / "s.zarr")
+    for row in range(5):
+        edit_record(out, row, lambda one: one["judgement"]["evidence"].pop())
+    with pytest.raises(StoreError, match="hold other evidence; build it again"):
+        measure_errors(open_store(out))
 
 
 def test_few_assets_are_said_to_be_few_and_the_picture_is_drawn(store):

@@ -37,7 +37,7 @@ from slatprep.parameters import (
 )
 from slatprep.particles.fields import stored_field
 from slatprep.readers.voxel_sets import field_of_voxels
-from slatprep.records import MATERIAL_COLOURS, PROPERTIES, Contents, Engine
+from slatprep.records import MATERIAL_COLOURS, Contents, Engine, SourceRoots
 from slatprep.store import Store
 
 TABLE = [
@@ -55,6 +55,7 @@ SOLID = [
 HARD = [TABLE[0], {"name": "hardness", "unit": "1", "scale": "linear"}]
 NAMES = [str(one["name"]) for one in TABLE]
 KNOWN = AlignParameters(engine=Engine.KNOWN)
+UNCHECKED = SourceRoots(Path(), Path(), plausibility="off")
 STRICT = SampleParameters("nearest", max_unphysical=1)
 
 
@@ -407,7 +408,7 @@ def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equ
     material = rng.integers(0, 254, 6)[rng.integers(0, 6, len(voxels))]
     values = rng.uniform(0.1, 0.4, (len(voxels), 3))
     field = field_of_voxels(
-        "here", voxels, values, resolution=side, material=material, classes=254, table=PROPERTIES
+        "here", voxels, values, resolution=side, material=material, classes=254, roots=UNCHECKED
     )
     for place, own, properties in zip(field.voxels, field.material, field.properties, strict=True):
         inside = (np.floor((voxels + 0.5) * 64 / side) == place).all(axis=1)
@@ -422,7 +423,8 @@ def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equ
 
 def test_a_point_without_usable_values_is_occupied_and_the_end_is_of_the_last_cell():
     values = np.array([[1e5, 1e3, 0.3], [np.nan, 1e3, 0.3]])
-    field = field_of_voxels("here", np.array([[0.5] * 3, [0.0] * 3]), values, max_unphysical=0.5)
+    points = np.array([[0.5] * 3, [0.0] * 3])
+    field = field_of_voxels("here", points, values, max_unphysical=0.5, roots=UNCHECKED)
     assert field.voxels.tolist() == [[63] * 3]
     assert np.argwhere(field.occupancy).tolist() == [[32] * 3, [63] * 3]
 

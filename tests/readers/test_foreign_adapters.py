@@ -18,7 +18,8 @@ from slatprep.readers.adapters import FoundField, Holding, made_by, source_adapt
 from slatprep.readers.contents import latent_space
 from slatprep.readers.foreign import ForeignLatents, ForeignSource
 from slatprep.readers.pixieverse import PixieVerse
-from slatprep.records import PROPERTIES, TRELLIS
+from slatprep.readers.voxel_sets import field_of_voxels
+from slatprep.records import PROPERTIES, TRELLIS, Units
 
 THEIRS = r"adapter 'mine' of theirs 1\.0: (gives|raises) "
 
@@ -95,6 +96,39 @@ def test_a_field_that_is_none_is_refused(make_pair, case):
     np.testing.assert_array_equal(field.voxels, sound.voxels)
     change = BAD_FIELDS[case](sound)
     refused(source(read=lambda *_: change and replace(sound, **change)), pair, 0.1)
+
+
+def test_stated_units_convert_once_and_values_are_compared_after_it(make_pair):
+    pair = make_pair()
+    sound = PixieVerse().read(pair, 0.1)
+    in_units = replace(pair, roots=replace(pair.roots, units=Units(density="g/cm^3")))
+    in_grams = sound.properties / np.float32([1, 1000, 1])
+
+    def helped(pair, max_unphysical):
+        return field_of_voxels(
+            pair.grid, sound.voxels, in_grams, material=sound.material, roots=pair.roots,
+            sources=sound.sources,
+        )  # fmt: skip
+
+    def alone(pair, max_unphysical):
+        return replace(sound, properties=in_grams)
+
+    for read in (helped, alone):
+        field = source(read=read).read(in_units, 0.1)
+        np.testing.assert_allclose(field.properties, sound.properties, rtol=1e-6)
+        with pytest.raises(InputError, match="look like g/cm"):
+            source(read=read).read(pair, 0.1)
+
+
+def test_a_field_in_an_eighth_of_the_grid_is_told(make_pair):
+    block = np.indices((5, 5, 5)).reshape(3, -1).T
+
+    def read(pair, max_unphysical):
+        values, files = np.tile([2e6, 930, 0.4], (125, 1)), PixieVerse().read(pair, 0.1).sources
+        return field_of_voxels(pair.grid, block, values, roots=pair.roots, sources=files)
+
+    (told,) = source(read=read).read(make_pair(), 0.1).warnings
+    assert "no coordinate is above 4, as on a grid of 32^3" in told
 
 
 @pytest.mark.parametrize("case", BAD_SLATS)
