@@ -210,6 +210,14 @@ def test_patterns_of_masks_that_name_no_file_are_told(tmp_path):
         f"{root}: no mask found; looked for */nope.npy",
         f"{root}: no bounds found; looked for one.npz",
     ]
+    dataset.having("b", seed=1)
+    mask = dataset.assets["b"].grid[..., 3] != 7
+    np.save(root / "b/clip_features_mask.npy", mask)
+    discover(dataset.parameters(), told.append)
+    assert told[2:] == [f"{root}: 1 of 2 have no mask (a): background counts as empty"]
+    np.save(root / "a/clip_features_mask.npy", mask)
+    discover(dataset.parameters(), told.append)
+    assert len(told) == 3
 
 
 def test_hdf5_with_a_group_per_asset(find, tmp_path):
