@@ -192,11 +192,12 @@ class SomePath(click.Path):
         """Return the value as a path."""
         if value == "":
             self.fail("is empty; expected a path", parameter, context)
-        if self.exists and not (path := Path(value)).exists():
+        # False also where it may not be looked at, unlike `Path.exists`.
+        if self.exists and not os.path.exists(value):  # noqa: PTH110
             from slatprep.storage.place import storage_of
 
-            fault = storage_of(path).absent(files=self.file_okay, folders=self.dir_okay)
-            self.fail(f"{click.format_filename(value)} {fault}", parameter, context)
+            fault = storage_of(Path(value)).absent(files=self.file_okay, folders=self.dir_okay)
+            self.fail(click.format_filename(f"{value} {fault}"), parameter, context)
         return super().convert(value, parameter, context)
 
 

@@ -266,7 +266,7 @@ def _check_paths(parameters: BuildParameters, origin: _Origin) -> None:
         try:
             if place_of(value).exists():
                 continue
-            fault = f"{storage_of(place_of(value)).absent()}; expected a path"
+            fault = f"{storage_of(place_of(value)).absent(folders=key == 'root')}; expected a path"
         except OSError as error:
             fault = f"cannot be looked at ({error.strerror}); expected a path"
         words = {"ranges": NAMED_RANGES, "split_by": (*NAMED_SPLITS, f"{CATEGORY}NAME")}.get(key)

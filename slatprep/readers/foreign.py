@@ -16,11 +16,10 @@ import orjson
 from annotated_types import MaxLen, MinLen
 
 from slatprep import records
-from slatprep.errors import InputError, SlatprepError
+from slatprep.errors import ConfigError, InputError, SlatprepError
 from slatprep.geometry.frames import split_transform
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
-from slatprep.readers.plausible import coarse_places
 from slatprep.readers.values import require_plausible
 from slatprep.records.json_types import Count
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
@@ -96,7 +95,7 @@ class ForeignSource(_Foreign):
             return tuple(map(str, self.adapter.patterns))
 
     def describe(self, source: PixieverseSource) -> Any:
-        """Return what the source holds."""
+        """Return what the source holds; ConfigError if its units are stated as logarithms."""
         with self._blamed():
             held = self.adapter.describe(source)
             classes = held.classes
@@ -110,7 +109,11 @@ class ForeignSource(_Foreign):
             named = all(CLASS_NAME.fullmatch(one) for one in classes)
             few = classes == records.MATERIAL_CLASSES or len(classes) <= records.MANY_BACKGROUND
             self._require(named and few, f"classes {classes!r}")
-            return held
+        for name, unit in vars(source.units).items():
+            if unit.startswith(records.LOG10):  # The adapter would have taken means of them.
+                what = f"{name} in {unit!r}, and the adapter {self.name!r} is another package's"
+                raise ConfigError(f"units: {what}; expected a unit without log10, or SI values")
+        return held
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[Any]:
         """Yield its fields."""
@@ -171,8 +174,10 @@ class ForeignSource(_Foreign):
         where, classes = pair.grid or pair.roots.pixieverse, contents.classes
         values, material = field.properties.copy(), field.material if field.classified else None
         told = require_plausible(where, values, material, table, classes, pair.roots)
-        if pair.roots.plausibility != "off":
-            told += coarse_places(field.voxels, side, f"make the voxels of a grid of {side}^3")
+        for one, column in zip(table, values.T, strict=True):
+            if not one.physical(column).all():
+                fault = f"has {one.name} that is not {one.allowed} after the stated units"
+                raise InputError(where, fault, "SI units, or those that `units` states")
         return replace(field, properties=values, warnings=(*field.warnings, *told))
 
 

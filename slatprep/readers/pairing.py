@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby, product
 
-from slatprep.errors import ConfigError, first_of, in_unicode
+from slatprep.errors import ConfigError, amount, first_of, in_unicode
 from slatprep.parameters import BuildParameters, PixieverseSource, SlatSource
 from slatprep.readers import adapters
 from slatprep.readers.contents import contents_of
@@ -147,15 +147,17 @@ def _unused(pairs: Sequence[AssetPair], sources: Sequence[PixieverseSource]) -> 
     """Yield a line for masks and bounds whose patterns name no file, and for masks of some only."""
     for number, source in enumerate(sources):
         annotations = chain.from_iterable(pair.annotations for pair in pairs)
-        own = [one for one in annotations if one.roots.number == number and not one.problem]
+        own = [one for one in annotations if one.roots.number == number]
         for role in ("mask", "bounds"):
             given, lacking = getattr(source, role), [one for one in own if not getattr(one, role)]
             if len(lacking) == len(own):
                 if given and given != getattr(PixieverseSource, role):
                     yield f"{source.root}: no {role} found; looked for {tried_names(given, {})}"
-            elif lacking and role == "mask":
-                named = f"{len(own):,} have no mask ({first_of(one.asset_id for one in lacking)})"
-                yield f"{source.root}: {len(lacking):,} of {named}: background counts as empty"
+            elif role == "mask" and (
+                names := {one.object_id for one in lacking if not one.problem}
+            ):
+                told = f"{amount(len(names), 'object')} without a mask ({first_of(sorted(names))})"
+                yield f"{source.root}: {told}, others with one: their background counts as empty"
 
 
 def _grids_of(

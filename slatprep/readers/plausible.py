@@ -234,26 +234,28 @@ def in_toml(units: Mapping[str, str]) -> str:
 def _other_units(truly: Mapping[str, str], stated: Units) -> Mistake:
     """Return the mistake that values are `truly` in these units, by property; empty for SI."""
     wrong = {name: unit for name, unit in truly.items() if unit != stated.of(name)}
-    revoked = {name: stated.of(name) for name in wrong if stated.of(name)}
+    revoked = [stated.of(name) for name in wrong if stated.of(name)]
     words = " and ".join(unit or _SI[name] for name, unit in wrong.items())
     if revoked:
-        words += f", not the stated {' and '.join(revoked.values())}"
-    settings = []
-    if in_si := in_toml({name: unit for name, unit in revoked.items() if not truly[name]}):
-        settings.append(f"leave {in_si} out if they are in SI units")
-    if others := in_toml(wrong):
-        settings.append(
-            f"or say {others} in [pixieverse] of the dataset definition (a TOML file "
-            "given with --config)"
+        words += f", not the stated {' and '.join(revoked)}"
+    # Whole, as the key is replaced in the file: a unit that is right must not get lost.
+    setting = f"leave {in_toml(vars(stated))} out if they are in SI units"
+    if whole := in_toml(truly):
+        setting = (
+            f"or say {whole} in [pixieverse] of the dataset definition (a TOML file given with "
+            "--config)"
         )
-    return Mistake(words, ", ".join(settings), partial(_scaled, stated, tuple(truly.values())))
+    return Mistake(words, setting, partial(_scaled, stated, truly))
 
 
-def _scaled(stated: Units, truly: Sequence[str], part: Part) -> Part:
+def _scaled(stated: Units, truly: Mapping[str, str], part: Part) -> Part:
     """Convert modulus and density from the true units to SI units, not from the stated ones."""
-    modulus = to_si(part.modulus / FACTORS.get(stated.youngs_modulus, 1.0), truly[0])
-    density = to_si(part.density / FACTORS.get(stated.density, 1.0), truly[1])
-    return part._replace(modulus=float(modulus), density=float(density))
+    scaled = {}
+    for name, value in (("youngs_modulus", part.modulus), ("density", part.density)):
+        was, unit = stated.of(name), truly[name]
+        # A stated logarithm is never wrong here: its values are in SI units, and stay.
+        scaled[name] = value if unit == was else float(to_si(value / FACTORS.get(was, 1.0), unit))
+    return part._replace(modulus=scaled["youngs_modulus"], density=scaled["density"])
 
 
 def _moved(order: Sequence[int], part: Part) -> Part:

@@ -101,6 +101,7 @@ def require_plausible(
         guess = likely[0].words + (f" (or {', or '.join(others)})" if others else "")
         what = f"the values look like {guess}: {what}"
         advice = f"SI units, in the documented order; {likely[0].setting}"
+        advice += "; check which of these it is" if others else ""
     if roots.plausibility == "warn":
         return [oddity("values", f'{what}; taken as they are (plausibility = "warn")')]
     raise InputError(

@@ -51,7 +51,7 @@ def field_of_voxels(
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
     whole = np.asarray(voxels).dtype.kind != "f"
-    if whole and roots.plausibility != "off":
+    if whole:
         way = f"say the grid's own resolution in {description}"
         anew = f"make the voxels of a grid of {resolution}^3"
         notes += coarse_places(cells, resolution, way if description else anew)

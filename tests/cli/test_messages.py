@@ -1,6 +1,7 @@
 """What commands say to somebody who meets them for the first time, and with which exit code."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -141,16 +142,19 @@ def test_a_lost_file_of_a_column_is_named_and_one_never_written_is_fine(copy):
 
 def test_what_is_absent_is_told_by_how_far_its_path_leads(tmp_path, monkeypatch):
     (tmp_path / "dang").symlink_to("nowhere")
+    (tmp_path / "far").symlink_to(os.fsdecode(b"\xff"))
     (tmp_path / ".cups").mkdir()
     nowhere = "is a link that leads nowhere (nowhere)"
     for path, said in [
         ("dang", f"{tmp_path / 'dang'} does not exist; {tmp_path / 'dang'} {nowhere}"),
         ("dang/x", f"{tmp_path / 'dang/x'} does not exist; {tmp_path / 'dang'} {nowhere}"),
+        ("far", "is a link that leads nowhere (\ufffd)"),
+        ("a" * 300, "cannot be looked for"),
         ("dung", f"{tmp_path} does, and holds the folders (none)"),
         ("cups", f"{tmp_path} does, and holds the folders (none)"),
         ("\udcff", "'\ufffd' does not exist"),
     ]:
-        error = " ".join(run("info", str(tmp_path / path), code=2).stderr.split())
+        error = " ".join(run("info", "--json", str(tmp_path / path), code=2).stderr.split())
         assert said.replace("'\ufffd'", str(tmp_path / "\ufffd")) in error
     for k in range(1000):
         (tmp_path / f"{k:03}").mkdir()

@@ -12,7 +12,7 @@ import pytest
 from support.installed import package
 
 from slatprep.errors import ConfigError, InputError
-from slatprep.parameters import SlatSource
+from slatprep.parameters import PixieverseSource, SlatSource
 from slatprep.readers import read_latents
 from slatprep.readers.adapters import FoundField, Holding, made_by, source_adapter
 from slatprep.readers.contents import latent_space
@@ -118,6 +118,12 @@ def test_stated_units_convert_once_and_values_are_compared_after_it(make_pair):
         np.testing.assert_allclose(field.properties, sound.properties, rtol=1e-6)
         with pytest.raises(InputError, match="look like g/cm"):
             source(read=read).read(pair, 0.1)
+    in_grams[:5, 1] = 3e37
+    with pytest.raises(InputError, match=r"density that is not .* after the stated units"):
+        source(read=alone).read(in_units, 0.1)
+    in_logs = PixieverseSource(Path("/a"), units=Units(youngs_modulus="log10 Pa"))
+    with pytest.raises(ConfigError, match="youngs_modulus in 'log10 Pa', and the adapter 'mine'"):
+        source(describe=lambda _: Holding(PROPERTIES, ())).describe(in_logs)
 
 
 def test_a_field_in_an_eighth_of_the_grid_is_told(make_pair):

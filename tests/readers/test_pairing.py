@@ -214,10 +214,15 @@ def test_patterns_of_masks_that_name_no_file_are_told(tmp_path):
     mask = dataset.assets["b"].grid[..., 3] != 7
     np.save(root / "b/clip_features_mask.npy", mask)
     discover(dataset.parameters(), told.append)
-    assert told[2:] == [f"{root}: 1 of 2 have no mask (a): background counts as empty"]
+    without = f"{root}: 1 object without a mask (a), others with one: "
+    assert told[2:] == [f"{without}their background counts as empty"]
     np.save(root / "a/clip_features_mask.npy", mask)
     discover(dataset.parameters(), told.append)
-    assert len(told) == 3
+    # A mask that is found counts, also that of an object without a SLAT.
+    np.save(root / "b/own.npy", mask)
+    (tmp_path / "slat/b.npz").unlink()
+    discover(dataset.parameters(pixieverse={"mask": ["{id}/own.npy"]}), told.append)
+    assert told[3:] == [f"{without}their background counts as empty"]
 
 
 def test_hdf5_with_a_group_per_asset(find, tmp_path):

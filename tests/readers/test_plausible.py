@@ -187,11 +187,16 @@ LEAVE_E, LEAVE_RHO = (f'leave units = {{ {one} }} out if' for one in (
      'leave units = { youngs_modulus = "MPa", density = "g/cm^3" } out if'),
     # Oak with E in MPa: without the unit E would be a million times too small, and plausible.
     ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "MPa", "density": "g/cm^3"},
-     "kg/m^3, not the stated g/cm^3 (or ", LEAVE_RHO),
+     "kg/m^3, not the stated g/cm^3 (or ", 'or say units = { youngs_modulus = "MPa" } in'),
     ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "GPa"},
      "Pa, not the stated GPa (or MPa, not the stated GPa, ", f"{LEAVE_E} they are in SI units"),
     ((METAL, 2e5, 7850, 0.3), {"youngs_modulus": "GPa"},
      "MPa, not the stated GPa (or kPa", 'order; or say units = { youngs_modulus = "MPa" } in'),
+    # The whole key is told, as it takes the place of the one that is there.
+    ((JELLY, 2, 0.93, 0.49), {"youngs_modulus": "MPa"}, "g/cm^3 (or ",
+     'or say units = { youngs_modulus = "MPa", density = "g/cm^3" } in'),
+    ((METAL, 11.3, 7.85, 0.3), {"youngs_modulus": "log10 Pa"}, "g/cm^3",
+     'or say units = { youngs_modulus = "log10 Pa", density = "g/cm^3" } in'),
 ])  # fmt: skip
 def test_of_stated_units_the_wrong_one_is_named(read, part, stated, guess, advice):
     with pytest.raises(InputError) as error:
