@@ -151,7 +151,7 @@ def build_store(
         before = look_back(place, pairs, wanted, crew, fresh, rehash, rehash_seed)
         if before.suffices and not keep_work:
             return _publish(before, begin)
-        before.check(crew.of(len(pairs)))
+        before = before.checked(crew.of(len(pairs)))
         context = BuildContext(parameters, wanted.recipe, work.spool, before.previous, strict)
         plan = plan_assets(pairs, context, crew, before.known)
         assets = _finish_all(pairs, plan, context, crew, None if keep_work else before)
@@ -233,8 +233,7 @@ def plan_build(
     if fresh:
         spool = Spool(work_directory(place.store) / "nothing")
     pairs = _discover(parameters, jobs)
-    before = look_back(place, pairs, wanted, crew, fresh, float(rehash))
-    before.check(jobs)
+    before = look_back(place, pairs, wanted, crew, fresh, float(rehash)).checked(jobs)
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
     plan = plan_assets(pairs, context, crew, before.known, ahead=True)
     absent = {one for one, planned in plan.items() if planned.action in _ABSENT}
