@@ -124,19 +124,19 @@ class Before:
     def _bound_to(self, store: Store) -> bytes:
         """Return a digest of this machine, the store and how sources are read, to bind states."""
         wanted, also = self.wanted, self.wanted.parameters.also
-        slat, contents = wanted.parameters.slat, wanted.declared
+        slat, held = wanted.parameters.slat, wanted.declared
         roots = (
             SourceRoots(
-                pixieverse=one.root,
-                slat=slat.root,
-                contents=contents,
-                adapter=one.adapter,
+                one.root,
+                slat.root,
+                held,
+                one.adapter,
                 units=one.units,
                 plausibility=one.plausibility,
             )
             for one in (wanted.parameters.pixieverse, *also)
         )
-        read = contents, slat, also, [reading_of(one) for one in roots]
+        read = held, slat, also, [reading_of(one) for one in roots]
         return bound_to(store.about.manifest, wanted.recipe.key("", {"": str(read)}))
 
     def _is_as_left(self, previous: SourceStore, state: bytes) -> bool:

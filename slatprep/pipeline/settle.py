@@ -65,8 +65,10 @@ def settle_rows(
         for asset in failed[:_TOLD]:  # No store and no record will tell of them.
             crew.tell(f"{asset.asset_id}: {asset.reason}")
         raise
-    how = (wanted.build, parameters.store, bool(stores))
-    return NextStore(rows, stores, ranges, contents, *how), failed
+    new = NextStore(
+        rows, stores, ranges, contents, wanted.build, parameters.store, replaces=bool(stores)
+    )
+    return new, failed
 
 
 def kept_rows(
@@ -74,40 +76,43 @@ def kept_rows(
     unchanged: Sequence[AssetPair],
     plan: Mapping[str, PlannedAsset],
     before: Before,
-) -> list[Row]:
-    """Return the rows of unchanged assets, if they can be taken over; else none.
+) -> list[Row] | None:
+    """Return the rows of unchanged assets in the existing store; None if they may not stay there.
 
-    They can be if the ranges stay, no pass over the whole dataset may change the
-    rows, and the rest of what decides a store's bytes is the same.
+    `made` are the other assets. Rows stay if the parameters that decide a store's bytes do, and
+    so do the ranges with the other assets' rows.
     """
     previous, wanted = before.previous, before.wanted
     if previous is None or before.damaged or not unchanged:
-        return []
-    declared = wanted.declared
-    tables = [(one.properties, one.classes) for one in (previous.contents, declared)]
-    if tables[0] != tables[1] or {**previous.build, "name": ""} != {**wanted.build, "name": ""}:
-        return []
+        return None
+    tables = [(one.properties, one.classes) for one in (previous.contents, wanted.declared)]
+    builds = [{**one.build, "name": ""} for one in (previous, wanted)]
+    if tables[0] != tables[1] or builds[0] != builds[1]:
+        return None
     sizes, rows = np.diff(previous.offsets).tolist(), []
     for planned in (plan[pair.asset_id] for pair in unchanged):
         row = previous.find(planned.asset_id)
         names, seen = planned.names, planned.seen
         rows.append(Row(planned.asset_id, sizes[row], store=0, row=row, names=names, seen=seen))
-    everything = [*rows, *(asset for asset in made if isinstance(asset, Row))]
-    if len(everything) == len(rows) == len(previous) and not any(row.names for row in rows):
+    added = [asset for asset in made if isinstance(asset, Row)]
+    return rows if _may_stay(rows, added, previous, before) else None
+
+
+def _may_stay(
+    rows: Sequence[Row], added: Sequence[Row], previous: SourceStore, before: Before
+) -> bool:
+    """Return whether `rows` of the existing store stay as they are beside the `added` ones."""
+    wanted, ranges = before.wanted, before.wanted.ranges
+    # Passes, percentiles, and ranges of the objects to train on look at the voxels of all assets.
+    by_rows = not wanted.passes and (isinstance(ranges, Normalization) or ranges == "dataset")
+    if not added and len(rows) == len(previous) and not any(row.names for row in rows):
         # A build of these assets would make the same rows. Subsets and joined stores have ranges
         # and placements of other assets, unless the rows alone show that these are the same.
-        by_rows = wanted.ranges == "dataset" or isinstance(wanted.ranges, Normalization)
-        same = before.built or (by_rows and not wanted.passes)
-        return rows if same and wanted.has_ranges(previous) else []
-    if wanted.passes:
-        return []
-    ranges = wanted.ranges
-    if isinstance(ranges, str):
-        if wanted.parameters.normalize.objects != "all" or percentiles_of(ranges):
-            return []  # Such ranges depend on the values of all fields.
-        extents = column("extent", everything, (previous,))
-        ranges = ranges_from_extents(extents, ranges, declared.properties)
-    return rows if ranges == previous.normalization else []
+        return (before.built or by_rows) and wanted.has_ranges(previous)
+    if by_rows and ranges == "dataset":
+        extents = column("extent", [*rows, *added], (previous,))
+        ranges = ranges_from_extents(extents, "dataset", wanted.declared.properties)
+    return by_rows and ranges == previous.normalization
 
 
 def resolved_contents(
@@ -115,7 +120,7 @@ def resolved_contents(
     stores: Sequence[SourceStore],
     declared: Contents,
     standardised: str,
-    before: LatentSpace | None = None,
+    known: LatentSpace | None = None,
 ) -> Contents:
     """Return the contents of a store, with the latent space that `resolve_latents` finds."""
     # Sums of the same numbers in another order differ in their last digits.
@@ -123,7 +128,7 @@ def resolved_contents(
     # Annotations of one object share its SLAT, which counts once.
     counts = (row.n_voxels for row in rows)
     moments = list(dict.fromkeys(zip(counts, moments_of(rows, stores), strict=True)))
-    latents = resolve_latents(declared.latents, standardised, moments, before)
+    latents = resolve_latents(declared.latents, standardised, moments, known)
     return replace(declared, latents=latents)
 
 
