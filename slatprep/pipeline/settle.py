@@ -20,7 +20,7 @@ from slatprep.pipeline.rows import NextStore, Row, SourceStore, column, in_order
 from slatprep.pipeline.spool import Spool
 from slatprep.readers.contents import resolve_latents
 from slatprep.readers.splits import Shares, assign_splits
-from slatprep.records import AssetPair, Contents, LatentSpace, Normalization
+from slatprep.records import AssetPair, Contents, LatentSpace, Normalization, Property
 from slatprep.store.record import FailedRecord
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -42,9 +42,9 @@ def settle_rows(
     """
     wanted, parameters = before.wanted, context.parameters
     declared = wanted.declared
-    rows = sorted((a for a in assets if isinstance(a, Row)), key=lambda row: row.asset_id)
+    assets = sorted(assets, key=lambda asset: asset.asset_id)
+    rows = [asset for asset in assets if isinstance(asset, Row)]
     failed = [asset for asset in assets if isinstance(asset, FailedRecord)]
-    failed.sort(key=lambda asset: asset.asset_id)
     if not rows:
         raise StoreError(nothing_usable(failed, parameters, before.pairs))
     stores: tuple[SourceStore, ...] = ()
@@ -65,10 +65,8 @@ def settle_rows(
         for asset in failed[:_TOLD]:  # No store and no record will tell of them.
             crew.tell(f"{asset.asset_id}: {asset.reason}")
         raise
-    new = NextStore(
-        rows, stores, ranges, contents, wanted.build, parameters.store, replaces=bool(stores)
-    )
-    return new, failed
+    build, replaces = wanted.build, bool(stores)
+    return NextStore(rows, stores, ranges, contents, build, parameters.store, replaces), failed
 
 
 def kept_rows(
@@ -90,10 +88,9 @@ def kept_rows(
     if tables[0] != tables[1] or builds[0] != builds[1]:
         return None
     sizes, rows = np.diff(previous.offsets).tolist(), []
-    for planned in (plan[pair.asset_id] for pair in unchanged):
-        row = previous.find(planned.asset_id)
-        names, seen = planned.names, planned.seen
-        rows.append(Row(planned.asset_id, sizes[row], store=0, row=row, names=names, seen=seen))
+    for one in (plan[pair.asset_id] for pair in unchanged):
+        row = previous.find(one.asset_id)
+        rows.append(Row(one.asset_id, sizes[row], store=0, row=row, names=one.names, seen=one.seen))
     added = [asset for asset in made if isinstance(asset, Row)]
     return rows if _may_stay(rows, added, previous, before) else None
 
@@ -157,12 +154,7 @@ def dataset_ranges(
     if (percentiles := percentiles_of(parameters.ranges)) is None:
         return ranges_from_extents([asset.columns["extent"] for asset in chosen], source, table)
     keys = list({_field_of(asset): asset.key for asset in reversed(chosen)}.values())
-    counts = _counted(spool, keys, jobs, len(table))
-    place = (counts[0].sum() - 1) * np.array(percentiles) / 100
-    upper, ranks = _at(counts, np.concatenate([np.floor(place), np.ceil(place)]).astype(int))
-    lower, _ = _at(_counted(spool, keys, jobs, len(table), upper), ranks)
-    below, above = np.split(to_mapped(_of_ranks(upper << _HALF | lower).T, table), 2)
-    lo, hi = below + (place % 1)[:, None] * (above - below)
+    lo, hi = _at_percentiles(percentiles, spool, keys, jobs, table)
     return ranges_from_bounds(lo, hi, source, table)
 
 
@@ -199,6 +191,23 @@ def _trained(
     return trained
 
 
+def _at_percentiles(
+    at: Sequence[float], spool: Spool, keys: Sequence[str], jobs: Jobs, table: Sequence[Property]
+) -> NDArray[np.float64]:
+    """Return the properties of all fields' voxels at two percentiles, (2, P), in mapped units.
+
+    Two passes find the value of any rank, in memory that does not grow with the number of values.
+    The first counts values by the upper half of their bits, which sort like the values. The second
+    counts those that share the upper half of a wanted rank, by their lower half.
+    """
+    counts = _counted(spool, keys, jobs, len(table))
+    place = (counts[0].sum() - 1) * np.array(at) / 100
+    upper, ranks = _at(counts, np.concatenate([np.floor(place), np.ceil(place)]).astype(int))
+    lower, _ = _at(_counted(spool, keys, jobs, len(table), upper), ranks)
+    below, above = np.split(to_mapped(_of_ranks(upper << _HALF | lower).T, table), 2)
+    return np.asarray(below + (place % 1)[:, None] * (above - below), np.float64)
+
+
 def _counted(
     spool: Spool,
     keys: Sequence[str],
@@ -218,11 +227,10 @@ def _counted(
 def count_halves(
     spool: Spool, key: str, upper: NDArray[np.uint32] | None
 ) -> list[tuple[NDArray[np.uint32], NDArray[np.int64]]]:
-    """Count a field's values by one half of their bits, which sort like the values.
+    """Count a field's values by one half of their bits, see `_at_percentiles`.
 
     Without `upper`, count each property's values by their upper 16 bits. Otherwise, for each upper
-    half in `upper` (P, R), count the property's values that have it by their lower 16 bits. So two
-    passes find the value of any rank, in memory that does not grow with the number of values.
+    half in `upper` (P, R), count the property's values that have it by their lower 16 bits.
     """
     bits = _in_order(spool.field(key).properties).T
     if upper is None:
@@ -255,5 +263,5 @@ def _at(
     """
     ends = counts.cumsum(axis=-1)
     values = (ends <= ranks[..., None]).sum(axis=-1)
-    before = np.take_along_axis(ends - counts, values[..., None], axis=-1)[..., 0]
-    return values.astype(np.uint32), ranks - before
+    smaller = np.take_along_axis(ends - counts, values[..., None], axis=-1)[..., 0]
+    return values.astype(np.uint32), ranks - smaller
