@@ -223,9 +223,8 @@ def _bent_shape() -> tuple[MaterialField, StructuredLatents]:
     occupied[20:44, 22:36, 26:34] = occupied[20:26, 22:36, 34:50] = True
     voxels = voxels_of(occupied)
     count = len(voxels)
-    field = MaterialField(
-        occupied, voxels, np.zeros(count, np.uint8), np.ones((count, 3), np.float32)
-    )
+    material, properties = np.zeros(count, np.uint8), np.ones((count, 3), np.float32)
+    field = MaterialField(occupied, voxels, material, properties)
     bent = voxels.copy()
     bent[:, 2] += ((bent[:, 0] - 20) ** 2 // 25).astype(np.uint8)
     bent = np.append(bent, np.zeros((1, 3), np.uint8), axis=0)  # far from every annotated voxel

@@ -123,20 +123,15 @@ class Before:
 
     def _bound_to(self, store: Store) -> bytes:
         """Return a digest of this machine, the store and how sources are read, to bind states."""
-        wanted, also = self.wanted, self.wanted.parameters.also
-        slat, held = wanted.parameters.slat, wanted.declared
+        wanted, parameters = self.wanted, self.wanted.parameters
+        held, slat = wanted.declared, parameters.slat.root
         roots = (
             SourceRoots(
-                one.root,
-                slat.root,
-                held,
-                one.adapter,
-                units=one.units,
-                plausibility=one.plausibility,
+                one.root, slat, held, one.adapter, units=one.units, plausibility=one.plausibility
             )
-            for one in (wanted.parameters.pixieverse, *also)
+            for one in (parameters.pixieverse, *parameters.also)
         )
-        read = held, slat, also, [reading_of(one) for one in roots]
+        read = held, parameters.slat, parameters.also, [reading_of(one) for one in roots]
         return bound_to(store.about.manifest, wanted.recipe.key("", {"": str(read)}))
 
     def _is_as_left(self, previous: SourceStore, state: bytes) -> bool:
@@ -203,8 +198,8 @@ def _store_state(place: Destination, manifests: Place, assets: int, wait: bool =
         wait_until_old()
     digest = hashlib.sha256()
     files = [Path(found, name) for found, _, names in os.walk(store) for name in names]
-    records = (folder / name for name in (*file_names(assets), BUILD))
-    for file in (*sorted(files), *records):
+    beside = (folder / name for name in (*file_names(assets), BUILD))
+    for file in (*sorted(files), *beside):
         try:
             state = file.stat()
         except OSError:

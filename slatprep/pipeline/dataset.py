@@ -54,8 +54,6 @@ from slatprep.workers.local import Jobs, require_shared, run_unordered, start_ea
 __all__ = ["BuildPlan", "BuildSummary", "Progress", "align_pairs", "build_store", "plan_build"]
 
 
-_ABSENT = (Action.REFUSE, Action.SKIP)
-
 _BROUGHT_ABOUT = (OSError, ArithmeticError, ValueError, MemoryError, RuntimeError, SlatprepError)
 """Errors that data and machines cause, unlike faults of slatprep itself."""
 
@@ -227,13 +225,11 @@ def plan_build(
     before = look_back(place, pairs, wanted, crew, fresh, float(rehash)).checked(jobs)
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
     plan = plan_assets(pairs, context, crew, before.known, ahead=True)
-    absent = {one for one, planned in plan.items() if planned.action in _ABSENT}
+    absent = {one.asset_id for one in plan.values() if one.action in (Action.REFUSE, Action.SKIP)}
     gone, ranges = place.lost({pair.asset_id for pair in pairs} - absent, "is")
-    given = wanted.ranges if isinstance(wanted.ranges, Normalization) else None
-    warnings = tuple(moved_ranges(given, ranges)) if given else ()
-    return BuildPlan(
-        place.out, tuple(plan.values()), before.damaged, why_taken_out(gone, absent), warnings
-    )
+    moved = moved_ranges(wanted.ranges, ranges) if isinstance(wanted.ranges, Normalization) else ()
+    taken_out = why_taken_out(gone, absent)
+    return BuildPlan(place.out, tuple(plan.values()), before.damaged, taken_out, tuple(moved))
 
 
 def align_pairs(

@@ -126,8 +126,8 @@ def checked_store(
     files = frozenset(finding.file for finding in findings)
     if any(file.startswith(_NEEDED) for file in files):
         return None, damaged
-    records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
-    return SourceStore(source, records), damaged
+    of_records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
+    return SourceStore(source, of_records), damaged
 
 
 IN_SPOOL = -1
