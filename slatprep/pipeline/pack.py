@@ -175,7 +175,10 @@ def _run_of(where: Where, asset: int) -> tuple[int, int]:
 
     Both are the same for assets that are adjacent there too.
     """
-    return (IN_SPOOL, 0) if isinstance(where, str) else (where.store, where.row - asset)
+    if isinstance(where, str):
+        return IN_SPOOL, 0
+    store, row, _ = where
+    return store, row - asset
 
 
 def _spooled(
@@ -226,14 +229,14 @@ def _move_rows(
     """Write rows of assets that are adjacent in an older store, converted to the new ranges."""
     if shard.group == "record":
         for asset, _ in assets:
-            there = shard.rows[asset]
-            text = record_text(source, there.row, there.names).decode()
+            _, row, names = shard.rows[asset]
+            text = record_text(source, row, names).decode()
             _append(writers, {RECORD_ARRAY: np.array([text], object)}, 1)
         return
     (first, begin), (last, end) = assets[0], assets[-1]
     edges = edges_of(shard.group, source.offsets.tolist())
-    start = edges[shard.rows[first].row] + begin.start
-    stop = edges[shard.rows[last].row] + end.stop
+    (_, first_row, _), (_, last_row, _) = shard.rows[first], shard.rows[last]
+    start, stop = edges[first_row] + begin.start, edges[last_row] + end.stop
     change = _renormaliser(source.normalization, normalization)
     names = [name for name in writers if source.holds(name)]
     at_a_time = _ROWS_MOVED if shard.group == "voxel" else 1
