@@ -58,6 +58,8 @@ from slatprep.store.record_json import faults_of
 _REASON, _TRACEBACK = 4_000, 100_000
 """Largest lengths of a failure's reason and traceback, which may contain a stranger's names."""
 
+_DIFFERS = "what the store holds of it is not what its record and its sources give"
+
 
 def process_asset(
     pair: AssetPair, parameters: BuildParameters, known: AssetRecord | None = None
@@ -72,8 +74,8 @@ def process_asset(
     field = read_field(pair, parameters.sample.max_unphysical)
     latents = read_latents(pair)
     reached("asset read", pair.asset_id)
-    before = (known.alignment, known.judgement) if known else ()
-    return annotate(pair, field, latents, parameters, *before)
+    alignment, judgement = (known.alignment, known.judgement) if known else (None, None)
+    return annotate(pair, field, latents, parameters, alignment, judgement)
 
 
 def finish_asset(
@@ -87,14 +89,10 @@ def finish_asset(
     reached("asset begun", pair.asset_id)
     if planned.action is Action.RESUME and (resumed := _resumed(planned, context.spool)):
         return resumed
-    damaged = ""
     try:
         with noting() as noted:
-            asset = _repeated(pair, planned, context)
-            aligned = asset is None
-            if asset is None:
-                asset = process_asset(pair, context.parameters)
-                damaged = "what the store holds of it is not what its record and its sources give"
+            repeated = _repeated(pair, planned, context)
+            asset = repeated or process_asset(pair, context.parameters)
         key = _key(asset, context.recipe)
         record = record_of(asset, context.recipe, key)
         if faults := faults_of(record):
@@ -105,10 +103,12 @@ def finish_asset(
         if context.strict:
             raise
         return record_of_failed(pair, context.recipe, *_why(error))
-    if planned.action is not Action.REUSE or planned.key != key:  # Sources changed since the plan.
-        damaged = ""
-    kept = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
-    return replace(kept, damaged=damaged, seen=as_read(pair, noted), aligned=aligned)
+    row = context.spool.put(record, asset.field, asset.latents, asset.annotation, asset.others)
+    aligned = repeated is None
+    # With another key its sources changed since the plan, and the store was right.
+    differs = aligned and planned.action is Action.REUSE and planned.key == key
+    damaged = _DIFFERS if differs else ""
+    return replace(row, damaged=damaged, seen=as_read(pair, noted), aligned=aligned)
 
 
 def fail_asset(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> FailedRecord:
@@ -133,9 +133,12 @@ def _repeated(pair: AssetPair, planned: PlannedAsset, context: BuildContext) -> 
 
 
 def _key(asset: Finished, recipe: Recipe) -> str:
-    sources = asset.field.sources + asset.latents.sources
-    shared = asset.latents if asset.pair.slat_group else None
-    digests = asset.digests or source_digests(sources, shared) | reading_of(asset.pair.roots)
+    """Return the key that follows from the sources as they were read."""
+    digests = asset.digests  # Of merged annotations, hashed before they were read.
+    if not digests:
+        sources = asset.field.sources + asset.latents.sources
+        shared = asset.latents if asset.pair.slat_group else None
+        digests = source_digests(sources, shared) | reading_of(asset.pair.roots)
     return recipe.key(asset.pair.asset_id, digests)
 
 
@@ -220,9 +223,8 @@ def _bent_shape() -> tuple[MaterialField, StructuredLatents]:
     occupied[20:44, 22:36, 26:34] = occupied[20:26, 22:36, 34:50] = True
     voxels = voxels_of(occupied)
     count = len(voxels)
-    field = MaterialField(
-        occupied, voxels, np.zeros(count, np.uint8), np.ones((count, 3), np.float32)
-    )
+    material, properties = np.zeros(count, np.uint8), np.ones((count, 3), np.float32)
+    field = MaterialField(occupied, voxels, material, properties)
     bent = voxels.copy()
     bent[:, 2] += ((bent[:, 0] - 20) ** 2 // 25).astype(np.uint8)
     bent = np.append(bent, np.zeros((1, 3), np.uint8), axis=0)  # far from every annotated voxel

@@ -15,7 +15,7 @@ import random
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from slatprep.errors import SlatprepError, StoreError
@@ -37,9 +37,9 @@ SHARE = 0.01
 """Share of the sources with an unchanged state that a build hashes nevertheless."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Before:
-    """The state before a build.
+    """The state before a build: as `look_back` finds it, then with a store that was `checked`.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Before:
     wanted : Wanted
         What is asked of the build.
     previous : SourceStore or None
-        The existing store; `check` reads its files.
+        The existing store; once `checked`, None if no build can go on from it.
     known : mapping of str to (bytes, str)
         State and key of the assets whose sources are as the last build saw them.
     built : bool
@@ -100,19 +100,19 @@ class Before:
         both = enumerate(zip(names, old, strict=False))
         return {name for k, (name, was) in both if name == was and (taken is None or k in taken)}
 
-    def check(self, jobs: Jobs) -> None:
-        """Compare the records and columns of the store with their digests.
+    def checked(self, jobs: Jobs) -> Before:
+        """Compare the records and columns of the store with their digests; add what is damaged.
 
         All other files are compared too, unless they are as the last build left them, or they lie
         on an object store, which keeps checksums of its own.
         """
         if self.previous is None:
-            return
+            return self
         trusted = self.as_left or storage_of(self.place.store).local is None
         below = "asset/" if trusted else ""
-        self.previous, self.damaged = checked_store(self.previous, jobs, below)
-        if self.damaged:
-            self.known = {}
+        previous, damaged = checked_store(self.previous, jobs, below)
+        known = {} if damaged else self.known
+        return replace(self, previous=previous, damaged=damaged, known=known)
 
     def note(self, store: Store, rows: Iterable[Row]) -> None:
         """Write the states of the sources of these rows, for a store that is in place."""
@@ -123,13 +123,15 @@ class Before:
 
     def _bound_to(self, store: Store) -> bytes:
         """Return a digest of this machine, the store and how sources are read, to bind states."""
-        wanted, also = self.wanted, self.wanted.parameters.also
-        slat, held = wanted.parameters.slat, wanted.declared
+        wanted, parameters = self.wanted, self.wanted.parameters
+        held, slat = wanted.declared, parameters.slat.root
         roots = (
-            SourceRoots(one.root, slat.root, held, one.adapter, 0, (), one.units, one.plausibility)
-            for one in (wanted.parameters.pixieverse, *also)
+            SourceRoots(
+                one.root, slat, held, one.adapter, units=one.units, plausibility=one.plausibility
+            )
+            for one in (parameters.pixieverse, *parameters.also)
         )
-        read = held, slat, also, [reading_of(one) for one in roots]
+        read = held, parameters.slat, parameters.also, [reading_of(one) for one in roots]
         return bound_to(store.about.manifest, wanted.recipe.key("", {"": str(read)}))
 
     def _is_as_left(self, previous: SourceStore, state: bytes) -> bool:
@@ -139,17 +141,16 @@ class Before:
         except StoreError:  # The store is damaged: its number of rows is not known.
             return False
 
-    def _sample(self, share: float, seed: int | None, crew: Crew) -> None:
+    def _sampled(self, share: float, seed: int | None, crew: Crew) -> Before:
         """Hash a share of the known sources; if one of them changed, forget all."""
         seed = time.time_ns() if seed is None else seed
         ids = sorted(self.known)
         drawn = set(random.Random(seed).sample(ids, math.ceil(share * len(ids))))
         tasks = [(pair, self.wanted.recipe) for pair in self.pairs if pair.asset_id in drawn]
         keys = run_unordered(key_of, tasks, crew.of(len(tasks)))
-        self.unnoticed = tuple(sorted(one for one, key in keys if key != self.known[one][1]))
-        self.seed = seed if drawn else None
-        if self.unnoticed:
-            self.known = {}
+        unnoticed = tuple(sorted(one for one, key in keys if key != self.known[one][1]))
+        known = {} if unnoticed else self.known
+        return replace(self, known=known, unnoticed=unnoticed, seed=seed if drawn else None)
 
 
 def look_back(
@@ -169,19 +170,19 @@ def look_back(
     if fresh:
         return before
     try:
-        before.previous = previous = SourceStore(open_store(place.store))
+        previous = SourceStore(open_store(place.store))
     except StoreError as error:
-        before.damaged = (str(error),) if is_store(place.store) else ()
-        return before
+        return replace(before, damaged=(str(error),) if is_store(place.store) else ())
     seen, state = read_seen(_seen_folder(place), before._bound_to(previous))
-    before.built, before.as_left = bool(state), before._is_as_left(previous, state)
+    as_left = before._is_as_left(previous, state)
     states = look(pairs) if seen and rehash < 1 else {}
-    with suppress(StoreError):  # A column is damaged, and `check` finds it.
+    known: dict[str, tuple[bytes, str]] = {}
+    with suppress(StoreError):  # A column is damaged, and `checked` finds it.
         keys = dict(zip(previous.ids, previous.column("key"), strict=True)) if states else {}
-        known = [name for name, own in states.items() if own in seen and name in keys]
-        before.known = {name: (states[name], keys[name].tobytes().hex()) for name in known}
-    before._sample(rehash, seed, crew)
-    return before
+        same = [name for name, own in states.items() if own in seen and name in keys]
+        known = {name: (states[name], keys[name].tobytes().hex()) for name in same}
+    before = replace(before, previous=previous, known=known, built=bool(state), as_left=as_left)
+    return before._sampled(rehash, seed, crew)
 
 
 def _store_state(place: Destination, manifests: Place, assets: int, wait: bool = False) -> bytes:
@@ -197,8 +198,8 @@ def _store_state(place: Destination, manifests: Place, assets: int, wait: bool =
         wait_until_old()
     digest = hashlib.sha256()
     files = [Path(found, name) for found, _, names in os.walk(store) for name in names]
-    records = (folder / name for name in (*file_names(assets), BUILD))
-    for file in (*sorted(files), *records):
+    beside = (folder / name for name in (*file_names(assets), BUILD))
+    for file in (*sorted(files), *beside):
         try:
             state = file.stat()
         except OSError:

@@ -54,9 +54,7 @@ from slatprep.workers.local import Jobs, require_shared, run_unordered, start_ea
 __all__ = ["BuildPlan", "BuildSummary", "Progress", "align_pairs", "build_store", "plan_build"]
 
 
-_ABSENT = (Action.REFUSE, Action.SKIP)
-
-_BROUGHT_ABOUT = (OSError, ArithmeticError, ValueError, MemoryError, RuntimeError)
+_BROUGHT_ABOUT = (OSError, ArithmeticError, ValueError, MemoryError, RuntimeError, SlatprepError)
 """Errors that data and machines cause, unlike faults of slatprep itself."""
 
 
@@ -137,41 +135,28 @@ def build_store(
     place, wanted = Destination(out, manifests), Wanted.of(parameters, compact)
     if decoys:
         writable_file(place.store)
-    with (
-        place.telling_if_stopped(),
-        work_beside(
-            place.store,
-            fresh=fresh,
-            keep=keep_work,
-            look=place.look,
-            private_disks=not isinstance(jobs, int),
-        ) as work,
-    ):
+    private_disks = not isinstance(jobs, int)
+    folder = work_beside(
+        place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=private_disks
+    )
+    with place.telling_if_stopped(), folder as work:
         pairs = _discover(parameters, jobs, work.shared(), note=note)
         before = look_back(place, pairs, wanted, crew, fresh, rehash, rehash_seed)
         if before.suffices and not keep_work:
             return _publish(before, begin)
-        before.check(crew.of(len(pairs)))
+        before = before.checked(crew.of(len(pairs)))
         context = BuildContext(parameters, wanted.recipe, work.spool, before.previous, strict)
         plan = plan_assets(pairs, context, crew, before.known)
-        assets = _finish_all(pairs, plan, context, crew, None if keep_work else before)
+        assets = _finish_all(pairs, plan, context, crew, before, keep_work=keep_work)
         new, failed = settle_rows(assets, before, context, crew)
-        records, spooled = None, sum(row.spooled for row in new.rows)
-        if not before.holds(new):
-            records = pack_store(work, place, new, crew.of(spooled))
-        aligned = sum(row.aligned for row in new.rows)
-        summary = _publish(before, begin, new, records, failed, aligned)
+        spooled = [row for row in new.rows if row.spooled]
+        changed = not before.holds(new)
+        taken = pack_store(work, place, new, crew.of(len(spooled))) if changed else None
+        summary = _publish(before, begin, new, taken, failed)
         if keep_work:
-            work.keep_only({row.key for row in new.rows if row.spooled})
-        if records is not None:
-            made = sum(plan[one].action is not Action.REUSE for one in new.ids)
-            try:
-                measure_build(place.in_place(), made, decoys, crew, before.previous)
-            except (*_BROUGHT_ABOUT, SlatprepError) as error:
-                # The store is published already, and stays.
-                told = f"errors were not measured ({error}); run `slatprep measure-errors`"
-                summary = replace(summary, warnings=(*summary.warnings, told))
-    return summary
+            work.keep_only({row.key for row in spooled})
+        made = sum(plan[one].action is not Action.REUSE for one in new.ids)
+        return _measured(summary, before, made, decoys, crew) if changed else summary
 
 
 def _finish_all(
@@ -179,14 +164,19 @@ def _finish_all(
     plan: Mapping[str, PlannedAsset],
     context: BuildContext,
     crew: Crew,
-    before: Before | None,
+    before: Before,
+    *,
+    keep_work: bool,
 ) -> list[Row | FailedRecord]:
-    """Return all assets; unchanged ones stay rows of the existing store if that is possible."""
+    """Return all assets; unchanged ones stay rows of the existing store if that is possible.
+
+    With `keep_work`, all are brought into the spool.
+    """
     reused = [pair for pair in pairs if plan[pair.asset_id].action is Action.REUSE]
     others = [pair for pair in pairs if plan[pair.asset_id].action is not Action.REUSE]
     made = finish(others, plan, context, crew)
-    kept = kept_rows(made, reused, plan, before) if before else []
-    return [*made, *(kept or finish(reused, plan, context, crew))]
+    kept = None if keep_work else kept_rows(made, reused, plan, before)
+    return made + (finish(reused, plan, context, crew) if kept is None else kept)
 
 
 def finish(
@@ -210,9 +200,8 @@ def finish(
     tasks = ((pair, plan[pair.asset_id], context) for pair in pairs)
     if crew.progress:
         crew.progress(0, len(pairs))
-    return list(
-        counted(run_unordered(finish_asset, tasks, jobs, fail_asset), len(pairs), crew.progress)
-    )
+    made = run_unordered(finish_asset, tasks, jobs, fail_asset)
+    return list(counted(made, len(pairs), crew.progress))
 
 
 def plan_build(
@@ -233,17 +222,14 @@ def plan_build(
     if fresh:
         spool = Spool(work_directory(place.store) / "nothing")
     pairs = _discover(parameters, jobs)
-    before = look_back(place, pairs, wanted, crew, fresh, float(rehash))
-    before.check(jobs)
+    before = look_back(place, pairs, wanted, crew, fresh, float(rehash)).checked(jobs)
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
     plan = plan_assets(pairs, context, crew, before.known, ahead=True)
-    absent = {one for one, planned in plan.items() if planned.action in _ABSENT}
+    absent = {one.asset_id for one in plan.values() if one.action in (Action.REFUSE, Action.SKIP)}
     gone, ranges = place.lost({pair.asset_id for pair in pairs} - absent, "is")
-    given = wanted.ranges if isinstance(wanted.ranges, Normalization) else None
-    warnings = tuple(moved_ranges(given, ranges)) if given else ()
-    return BuildPlan(
-        place.out, tuple(plan.values()), before.damaged, why_taken_out(gone, absent), warnings
-    )
+    moved = moved_ranges(wanted.ranges, ranges) if isinstance(wanted.ranges, Normalization) else ()
+    taken_out = why_taken_out(gone, absent)
+    return BuildPlan(place.out, tuple(plan.values()), before.damaged, taken_out, tuple(moved))
 
 
 def align_pairs(
@@ -275,13 +261,10 @@ def align_pairs(
         assets = sorted(finish(pairs, plan, context, crew), key=lambda asset: asset.asset_id)
         digests = []
         with writing(str(out), out.parent), staged(out) as partial, partial.open("wb") as file:
-            for asset in assets:
-                if isinstance(asset, FailedRecord):
-                    text = to_json(asset)
-                else:
-                    text = work.spool.record_text(asset.key)
+            for one in assets:
+                text = work.spool.record_text(one.key) if isinstance(one, Row) else to_json(one)
                 file.write(text + b"\n")
-                digests.append((asset.asset_id, digest_of(text)))
+                digests.append((one.asset_id, digest_of(text)))
     failed = [asset for asset in assets if isinstance(asset, FailedRecord)]
     rows = [asset for asset in assets if isinstance(asset, Row)]
     counts = counts_of(
@@ -308,16 +291,15 @@ def _publish(
     before: Before,
     begin: float,
     new: NextStore | None = None,
-    records: frozenset[int] | None = None,
+    taken: frozenset[int] | None = None,
     failed: Sequence[FailedRecord] = (),
-    aligned: int = 0,
 ) -> BuildSummary:
     """Publish the new or unchanged store with its manifests; note the states of sources.
 
-    `records` are the shards of records that were taken over; None if no store was written.
+    `taken` has the shards of records that were taken over; it is None if no store was written.
     """
     place, previous = before.place, before.previous
-    store = place.in_place() if previous is None or records is not None else previous
+    store = place.in_place() if previous is None or taken is not None else previous
     parameters = before.wanted.parameters
     rows, warnings = new.rows if new else (), list[str]()
     if before.unnoticed:
@@ -325,7 +307,7 @@ def _publish(
             f"the sources of {', '.join(before.unnoticed[:3])} changed, though their files look as "
             "they did; all sources were hashed"
         )
-    if new and records is not None:
+    if new and taken is not None:
         warnings += [*dataset_notices(new, parameters, failed), *much_clipped(store)]
     damaged = [f"{row.asset_id}: {row.damaged}" for row in rows if row.damaged]
     summary = publish_build(
@@ -334,12 +316,28 @@ def _publish(
         parameters,
         begin,
         failed,
-        before.standing_files(len(store), records),
-        aligned=aligned,
+        before.standing_files(len(store), taken),
+        aligned=sum(row.aligned for row in rows),
         warnings=warnings,
         damaged=(*before.damaged, *damaged),
         rehash_seed=before.seed,
     )
     if new:
         before.note(store, rows)
+    return summary
+
+
+def _measured(
+    summary: BuildSummary, before: Before, made: int, decoys: int, crew: Crew
+) -> BuildSummary:
+    """Measure the errors of the store that was written; add a warning to the summary if not.
+
+    `made` is the number of its assets that the plan did not find in the existing store.
+    """
+    try:
+        measure_build(before.place.in_place(), made, decoys, crew, before.previous)
+    except _BROUGHT_ABOUT as error:
+        # The store is published already, and stays.
+        told = f"errors were not measured ({error}); run `slatprep measure-errors`"
+        return replace(summary, warnings=(*summary.warnings, told))
     return summary

@@ -12,6 +12,7 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import orjson
@@ -152,15 +153,15 @@ def measure_errors(
 
 
 def measure_build(
-    store: Store, aligned: int, most: int, crew: Crew, before: SourceStore | None
+    store: Store, aligned: int, most: int, crew: Crew, previous: SourceStore | None
 ) -> None:
     """Measure the errors of a store that a build has just written, on as many decoys as allowed.
 
     `aligned` is the number of assets that the build aligned, `most` the largest number of decoys,
-    and `before` the store that was replaced. If no decoy is allowed, the earlier measurement stays,
-    and `told_of` says that it is an earlier one.
+    and `previous` the store that was replaced. If no decoy is allowed, the earlier measurement
+    stays, and `told_of` says that it is an earlier one.
     """
-    measured = measured_errors(store.path) or (measured_errors(before.path) if before else None)
+    measured = measured_errors(store.path) or (measured_errors(previous.path) if previous else None)
     new = min(allowed_decoys(aligned), most)
     if new == 0 or count_objects(store) < LEAST_TARGETS or why_no_decoys(store):
         if measured:
@@ -220,12 +221,9 @@ def draw_decoys(
         at, taken = place[row], paired[objects[row]] | {objects[row]}
         if len(taken) == every:
             continue  # It has met all others, so the search below would be of all rows.
-        smaller = (by_size[k] for k in range(at - 1, -1, -1))
-        larger = (by_size[k] for k in range(at + 1, len(by_size)))
-        firsts = (
-            next((k for k in side if objects[k] not in taken), None) for side in (smaller, larger)
-        )
-        if near := [k for k in firsts if k is not None]:
+        sides = range(at - 1, -1, -1), range(at + 1, len(by_size))  # smaller ones, and larger ones
+        others = ((by_size[k] for k in own if objects[by_size[k]] not in taken) for own in sides)
+        if near := [k for own in others for k in islice(own, 1)]:
             other = min(near, key=lambda k: abs(sizes[k] - sizes[row]))
             paired[objects[row]].add(objects[other])
             drawn.append(Decoy(ids[row], ids[other], (keys[ids[row]], keys[ids[other]])))

@@ -103,8 +103,9 @@ def subset_store(
             f"no asset of {source.path} is chosen; expected one at least: there are {there}"
         )
     place, parameters = Destination(out, manifests), _parameters([source], source.build)
-    how = source.normalization, source.contents, source.build, parameters.store
-    return _write(NextStore(rows, (source,), *how), parameters, place, jobs, progress)
+    ranges, contents = source.normalization, source.contents
+    new = NextStore(rows, (source,), ranges, contents, source.build, parameters.store)
+    return _write(new, parameters, place, jobs, progress)
 
 
 def concat_stores(
@@ -154,9 +155,9 @@ def concat_stores(
         )
     build, contents = _common_build(sources), _common_contents(sources, rows)
     place, parameters = Destination(out, manifests), _parameters(sources, build)
-    how = _common_ranges(sources), contents, build, parameters.store
-    rows = in_order(rows, None, compact=True)
-    return _write(NextStore(rows, tuple(sources), *how), parameters, place, jobs, progress)
+    rows, ranges = in_order(rows, None, compact=True), _common_ranges(sources)
+    new = NextStore(rows, tuple(sources), ranges, contents, build, parameters.store)
+    return _write(new, parameters, place, jobs, progress)
 
 
 def _source(store: Store | str | Place) -> SourceStore:

@@ -163,8 +163,7 @@ def shared_rotation(new: NextStore) -> Iterator[str]:
     if not any(row.spooled for row, ties in zip(new.rows, tied, strict=True) if ties):
         return
     sure = ~tied & (new.column("verdict") != Verdict.FAILED)
-    voting = new.column("transform")[sure], new.column("object_id")[sure]
-    if common := find_consensus(*voting):
+    if common := find_consensus(new.column("transform")[sure], new.column("object_id")[sure]):
         yield (
             f"{tied.sum():,} of {len(tied):,} assets have other placements that fit about as well, "
             f"and {common.agreeing:,} of {common.winners:,} other objects share a rotation: "

@@ -19,15 +19,15 @@ from slatprep.normalize import (
     normalize_properties,
 )
 from slatprep.pipeline.destination import Destination
-from slatprep.pipeline.rows import NextStore, SourceStore, Where, record_text
-from slatprep.pipeline.spool import Spool
+from slatprep.pipeline.rows import IN_SPOOL, NextStore, SourceStore, Where, record_text
+from slatprep.pipeline.spool import Arrays, Spool
 from slatprep.pipeline.work import Work
 from slatprep.records import UNANNOTATED, Normalization, Place
 from slatprep.storage.atomic import writing
 from slatprep.storage.faults import reached
 from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
-from slatprep.storage.remote import put_objects
+from slatprep.storage.remote import RemotePlace, put_objects
 from slatprep.storage.upload import Staged
 from slatprep.storage.work import work_directory
 from slatprep.store.integrity import open_for_writing
@@ -46,8 +46,8 @@ from slatprep.store.writer import (
 from slatprep.workers import Progress, counted
 from slatprep.workers.local import Jobs, run_unordered
 
-Arrays = dict[str, NDArray[Any]]
-"""Rows of arrays, by their full names."""
+Files = dict[str, Written]
+"""Size and SHA-256 of files by name."""
 
 _ROWS_MOVED = 65_536
 """Number of rows of an older store that are unpacked at a time, 4 MB in all arrays."""
@@ -66,49 +66,58 @@ def pack_store(
     """
     with writing(str(place.out), work_directory(place.store).parent):
         path = work.scratch / "store.zarr"
-        staged, records = _made(path, new, work, jobs, progress)
+        staged, taken = _made(path, new, work, jobs, progress)
         place.replace(path, new.ids, staged)
-    return records
+    return taken
 
 
 def _made(
     path: Path, new: NextStore, work: Work, jobs: Jobs, progress: Progress | None
 ) -> tuple[Staged, frozenset[int]]:
-    """Make a store; return its files that are not at `path`, and its shards of records taken over.
+    """Make a store at `path`; return its files, and its shards of records that were taken over.
 
     Shards go to `work.shards` if that is on an object store.
     """
     create_store(path, len(new.rows), new.offsets[-1], new.parameters, new.contents, new.merged)
     reached("store created", path.name)
-    remote = storage_of(work.shards).remote
-    if remote is not None:
+    version = storage_of(work.shards).remote
+    if version is not None:
         names = [name for group in GROUPS for name in arrays_in(group, new.merged)]
-        put_objects(path, remote, [f"{name}/zarr.json" for name in names])
+        put_objects(path, version, [f"{name}/zarr.json" for name in names])
     runs = {group: _runs(path, group, new) for group in GROUPS}
     taken = _taken(new, runs)
     todo = list(shards([row.where for row in new.rows], new.offsets, new.parameters, runs, taken))
-    clipped = {group: new.column(name) for group, name in _CLIPPED.items()}
-    here, written = remote or path, dict[str, Written]()
     # Shards of grids take longest, so they go first: the last shards keep all workers busy.
     todo.sort(key=lambda shard: shard.group != "grid")
-    how = new.normalization, new.contents.background, new.merged
-    tasks = ((here, work.spool, new.stores, shard, *how) for shard in todo)
+    clipped = {name: new.column(name) for name in _CLIPPED.values()}
+    written: Files = {}
+    place, ranges, merged = version or path, new.normalization, new.merged
+    background = new.contents.background
+    tasks = ((place, work.spool, new.stores, shard, ranges, background, merged) for shard in todo)
     made = run_unordered(write_shard, tasks, jobs)
     for shard, counts, files in counted(made, len(todo), progress):
-        if shard.group in clipped:
-            clipped[shard.group][shard.first : shard.first + len(shard.rows)] += counts
+        if name := _CLIPPED.get(shard.group):
+            clipped[name][shard.first : shard.first + len(shard.rows)] += counts
         written |= files
     reached("records written", path.name)
-    _write_columns(path, new, {_CLIPPED[group]: counts for group, counts in clipped.items()})
-    files = _take(path, new, taken)
-    before = storage_of(new.stores[0].path).remote if files else None
-    copied = files if before else {}
-    afar = copied | written if remote else copied
-    sizes = {name: file.size for name, file in afar.items()}
-    digests = {name: file.sha256 for name, file in (written | files).items()}
-    finish_store(path, new.normalization, new.build_id, new.build, new.contents, digests, sizes)
-    records = frozenset(number for group, number in taken if group == "record")
-    return Staged(sizes, digests, remote, before, frozenset(copied)), records
+    _write_columns(path, new, clipped)
+    staged = _staged(new, version, written, _take(path, new, taken))
+    finish_store(path, ranges, new.build_id, new.build, new.contents, staged.digests, staged.sizes)
+    return staged, frozenset(number for group, number in taken if group == "record")
+
+
+def _staged(new: NextStore, version: RemotePlace | None, written: Files, taken: Files) -> Staged:
+    """Return the digests of all shards, and which are on an object store but not at `path`.
+
+    Those are the shards `written` by workers into a `version` there, and the shards `taken` over
+    from an older version, which the server copies. All others lie at `path` already.
+    """
+    older = storage_of(new.stores[0].path).remote if taken else None
+    copied = taken if older else {}
+    away = {**copied, **written} if version else copied
+    sizes = {name: file.size for name, file in away.items()}
+    digests = {name: file.sha256 for name, file in (written | taken).items()}
+    return Staged(sizes, digests, version, older, frozenset(copied))
 
 
 def write_shard(
@@ -119,7 +128,7 @@ def write_shard(
     normalization: Normalization,
     background: int,
     merged: bool,
-) -> tuple[Shard, NDArray[np.int64], dict[str, Written]]:
+) -> tuple[Shard, NDArray[np.int64], Files]:
     """Write one shard of every array of its group into the new store at `path`.
 
     `merged` says whether the store has arrays of merged labels. Return the shard, the number of
@@ -139,14 +148,13 @@ def write_shard(
                 _copy_chunks(writers, stores[run.store], start + run.shift, stop + run.shift)
                 continue
             assets = overlaps(shard.offsets, start, stop)
-            for there, own in groupby(assets, lambda one: _follows(shard.rows[one[0]], one[0])):
-                if there is not None:
-                    _move_rows(writers, stores[there[0]], shard, list(own), normalization)
+            for (store, _), own in groupby(assets, lambda one: _run_of(shard.rows[one[0]], one[0])):
+                if store != IN_SPOOL:
+                    _move_rows(writers, stores[store], shard, list(own), normalization)
                     continue
                 for asset, rows in own:
-                    key = str(shard.rows[asset])
                     arrays, counts = _spooled(
-                        spool, key, shard.group, rows, normalization, background
+                        spool, shard.rows[asset], shard.group, rows, normalization, background
                     )
                     clipped[asset] += counts
                     _append(writers, arrays, rows.stop - rows.start)
@@ -162,9 +170,15 @@ def arrays_in(group: str, merged: bool) -> list[str]:
     return [one.name for one in arrays_with(merged) if one.name.startswith(f"{group}/")]
 
 
-def _follows(where: Where, asset: int) -> tuple[int, int] | None:
-    """Return a value that assets with adjacent rows in an older store share; None if spooled."""
-    return None if isinstance(where, str) else (where[0], where[1] - asset)
+def _run_of(where: Where, asset: int) -> tuple[int, int]:
+    """Return the number of an asset's store, or `IN_SPOOL`, and the shift to its row there.
+
+    Both are the same for assets that are adjacent there too.
+    """
+    if isinstance(where, str):
+        return IN_SPOOL, 0
+    store, row, _ = where
+    return store, row - asset
 
 
 def _spooled(
@@ -216,13 +230,13 @@ def _move_rows(
     if shard.group == "record":
         for asset, _ in assets:
             _, row, names = shard.rows[asset]
-            text = record_text(source, int(row), names).decode()
+            text = record_text(source, row, names).decode()
             _append(writers, {RECORD_ARRAY: np.array([text], object)}, 1)
         return
     (first, begin), (last, end) = assets[0], assets[-1]
     edges = edges_of(shard.group, source.offsets.tolist())
-    start = edges[int(shard.rows[first][1])] + begin.start
-    stop = edges[int(shard.rows[last][1])] + end.stop
+    (_, first_row, _), (_, last_row, _) = shard.rows[first], shard.rows[last]
+    start, stop = edges[first_row] + begin.start, edges[last_row] + end.stop
     change = _renormaliser(source.normalization, normalization)
     names = [name for name in writers if source.holds(name)]
     at_a_time = _ROWS_MOVED if shard.group == "voxel" else 1
@@ -299,12 +313,12 @@ def _taken(new: NextStore, runs: Mapping[str, Runs]) -> set[tuple[str, int]]:
     return taken
 
 
-def _take(path: Path, new: NextStore, taken: Collection[tuple[str, int]]) -> dict[str, Written]:
+def _take(path: Path, new: NextStore, taken: Collection[tuple[str, int]]) -> Files:
     """Put the taken shards into the new store; return their files.
 
     On an object store they are only named; the server copies them when the others are uploaded.
     """
-    files: dict[str, Written] = {}
+    files: Files = {}
     for group, number in sorted(taken):
         source = new.stores[0]
         local = storage_of(source.path).local

@@ -81,9 +81,8 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
     tied = [asset for asset in assets if asset.columns["n_placements"]]
     others = [asset for asset in assets if not asset.columns["n_placements"]]
     voting = [one.columns for one in others if one.columns["verdict"] != Verdict.FAILED]
-    consensus = find_consensus(
-        [one["transform"] for one in voting], [one["object_id"] for one in voting]
-    )
+    transforms = [one["transform"] for one in voting]
+    consensus = find_consensus(transforms, [one["object_id"] for one in voting])
     if consensus is None:
         crew.tell(f"consensus: too few objects share a rotation; {len(tied):,} tied ones stay")
         return assets
@@ -93,9 +92,8 @@ def apply_consensus(assets: list[Row], context: BuildContext, crew: Crew) -> lis
     changed = {asset.asset_id: asset for asset in settled}
 
     def moved(some: list[Row]) -> int:
-        pairs = ((one.columns["transform"], changed[one.asset_id].columns["transform"])
-                 for one in some)  # fmt: skip
-        return sum(not np.array_equal(before, after) for before, after in pairs)
+        both = ((one.columns, changed[one.asset_id].columns) for one in some)
+        return sum(not np.array_equal(old["transform"], new["transform"]) for old, new in both)
 
     crew.tell(
         f"consensus: {consensus.agreeing:,} of {consensus.winners:,} objects without a tie share a "
@@ -110,11 +108,11 @@ def settle_asset(
 ) -> Row:
     """Settle one asset's tie, or weigh its heading; return the same row if nothing changes."""
     first = Reopened(asset, spool)
-    field, latents, before = first.field, first.latents, first.alignment
-    alignment = settle(before, latents, consensus)
-    if alignment is before:
-        alignment = turn_if_likelier(before, field, latents, consensus, parameters.align)
-    if alignment is before:
+    own, field, latents = first.alignment, first.field, first.latents
+    alignment = settle(own, latents, consensus)
+    if alignment is own:
+        alignment = turn_if_likelier(own, field, latents, consensus, parameters.align)
+    if alignment is own:
         return asset
     first.place(alignment, parameters)
     return first.put()
@@ -136,7 +134,8 @@ def apply_witness(assets: list[Row], context: BuildContext, crew: Crew, labels: 
         crew.tell(f"witness: {len(good):,} good assets have too few classes; latents are not used")
         return assets
     model_of = [models[witness.fold_of(object_id)] for object_id in objects]
-    tasks = ((*task, spool, parameters) for task in zip(assets, model_of, strict=True))
+    both = zip(assets, model_of, strict=True)
+    tasks = ((asset, model, spool, parameters) for asset, model in both)
     evidence = list(run_in_order(weigh_asset, tasks, jobs))
     reliability = witness.reliability_of((objects[k], evidence[k]) for k in good)
     choices = [witness.choice_of(found, reliability) for found in evidence]
@@ -162,8 +161,8 @@ def weigh_asset(
 ) -> witness.LatentEvidence:
     """Return the evidence of an asset's latents on its labels."""
     first = Reopened(asset, spool)
-    placed = first.field, first.latents, first.alignment, first.annotation.material
-    return witness.weigh(*placed, model, parameters.sample)
+    field, latents, material = first.field, first.latents, first.annotation.material
+    return witness.weigh(field, latents, first.alignment, material, model, parameters.sample)
 
 
 def apply_latents(

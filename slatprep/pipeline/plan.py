@@ -174,9 +174,8 @@ def plan_assets(
         plan[planned.asset_id] = planned
         if crew.progress:
             crew.progress(len(plan), len(pairs))
-    gone = set(() if context.previous is None else context.previous.ids) - {
-        one.asset_id for one in pairs
-    }
+    there = () if context.previous is None else context.previous.ids
+    gone = set(there) - {pair.asset_id for pair in pairs}
     plan |= {one: PlannedAsset(one, Action.REMOVE, why) for one, why in why_taken_out(gone).items()}
     return dict(sorted(plan.items()))
 

@@ -246,7 +246,6 @@ def build_record(
     store: Store, summary: BuildSummary, parameters: BuildParameters, failed: Iterable[FailedRecord]
 ) -> BuildRecord:
     """Return the record of a build that made a store."""
-    voxels = summary.n_voxels, summary.n_valid, dict(summary.clipped), summary.n_unphysical
     return BuildRecord(
         id=summary.build_id,
         name=parameters.name,
@@ -260,7 +259,12 @@ def build_record(
         normalization=store.normalization,
         statuses=summary.statuses,
         verdicts=summary.verdicts,
-        counts=BuildCounts(*voxels),
+        counts=BuildCounts(
+            voxels=summary.n_voxels,
+            valid=summary.n_valid,
+            clipped=dict(summary.clipped),
+            unphysical=summary.n_unphysical,
+        ),
         failed=tuple(_as_many_as_fit(failed)),
     )
 

@@ -126,8 +126,8 @@ def checked_store(
     files = frozenset(finding.file for finding in findings)
     if any(file.startswith(_NEEDED) for file in files):
         return None, damaged
-    records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
-    return SourceStore(source, records), damaged
+    of_records = frozenset(file for file in files if file.startswith(RECORD_ARRAY))
+    return SourceStore(source, of_records), damaged
 
 
 IN_SPOOL = -1
@@ -193,6 +193,8 @@ class Row:
         return self.key if self.spooled else (self.store, self.row, self.names)
 
 
+# A plain tuple: tasks take one of every row to workers and back, and a named tuple is pickled in
+# nine times the time.
 Where = str | tuple[int, int, Names | None]
 """Place of a row's arrays: its key in the spool; or its store, its row there and its new names."""
 
@@ -284,20 +286,30 @@ class NextStore:
 
     def column(self, name: str) -> NDArray[Any]:
         """Return an ``asset/*`` array by its last name; spooled rows have no clipped values yet."""
-        if name in ("id", "offset"):
-            return np.array(self.ids, object) if name == "id" else np.array(self.offsets, np.int64)
+        if name == "id":
+            return np.array(self.ids, object)
+        if name == "offset":
+            return np.array(self.offsets, np.int64)
         if name == "record_sha256":
             return self.digests
-        values = column(name, self.rows, self.stores)
         if name == "property_ambiguity":
-            # Spooled rows have it in mapped units, because ranges come from the dataset.
-            other = [source.normalization != self.normalization for source in self.stores]
-            at = [k for k, row in enumerate(self.rows) if row.spooled or other[row.store]]
-            for k, row in ((k, self.rows[k]) for k in at if not self.rows[k].spooled):
+            return self._property_ambiguity()
+        return column(name, self.rows, self.stores)
+
+    def _property_ambiguity(self) -> NDArray[Any]:
+        """Return this column, normalised like the properties.
+
+        Stores have it in their own ranges. Spooled rows have it in mapped units, as records do,
+        because ranges come from the dataset.
+        """
+        values = column("property_ambiguity", self.rows, self.stores)
+        other = [source.normalization != self.normalization for source in self.stores]
+        mapped = [k for k, row in enumerate(self.rows) if row.spooled or other[row.store]]
+        for k in mapped:
+            if not (row := self.rows[k]).spooled:
                 document = orjson.loads(self.stores[row.store].text(row.row))
                 values[k] = document["judgement"]["ambiguity"]["property_change"]
-            if at:
-                values[at] = normalize_change(values[at], self.normalization)
+        values[mapped] = normalize_change(values[mapped], self.normalization)
         return values
 
 
@@ -310,9 +322,8 @@ def column(name: str, rows: Sequence[Row], stores: Sequence[SourceStore]) -> NDA
         if at := [k for k, row in enumerate(rows) if row.store == number]:
             parts.append((at, source.column(name)[[rows[k].row for k in at]]))
     first = np.asarray(parts[0][1])
-    values = np.empty(
-        (len(rows), *first.shape[1:]), object if first.dtype.kind == "U" else first.dtype
-    )
+    dtype = object if first.dtype.kind == "U" else first.dtype
+    values = np.empty((len(rows), *first.shape[1:]), dtype)
     for at, own in parts:
         values[at] = own
     for k, row in enumerate(rows):

@@ -20,7 +20,7 @@ from slatprep.pipeline.rows import NextStore, Row, SourceStore, column, in_order
 from slatprep.pipeline.spool import Spool
 from slatprep.readers.contents import resolve_latents
 from slatprep.readers.splits import Shares, assign_splits
-from slatprep.records import AssetPair, Contents, LatentSpace, Normalization
+from slatprep.records import AssetPair, Contents, LatentSpace, Normalization, Property
 from slatprep.store.record import FailedRecord
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -42,9 +42,9 @@ def settle_rows(
     """
     wanted, parameters = before.wanted, context.parameters
     declared = wanted.declared
-    rows = sorted((a for a in assets if isinstance(a, Row)), key=lambda row: row.asset_id)
+    assets = sorted(assets, key=lambda asset: asset.asset_id)
+    rows = [asset for asset in assets if isinstance(asset, Row)]
     failed = [asset for asset in assets if isinstance(asset, FailedRecord)]
-    failed.sort(key=lambda asset: asset.asset_id)
     if not rows:
         raise StoreError(nothing_usable(failed, parameters, before.pairs))
     stores: tuple[SourceStore, ...] = ()
@@ -65,8 +65,8 @@ def settle_rows(
         for asset in failed[:_TOLD]:  # No store and no record will tell of them.
             crew.tell(f"{asset.asset_id}: {asset.reason}")
         raise
-    how = (wanted.build, parameters.store, bool(stores))
-    return NextStore(rows, stores, ranges, contents, *how), failed
+    build, replaces = wanted.build, bool(stores)
+    return NextStore(rows, stores, ranges, contents, build, parameters.store, replaces), failed
 
 
 def kept_rows(
@@ -74,40 +74,42 @@ def kept_rows(
     unchanged: Sequence[AssetPair],
     plan: Mapping[str, PlannedAsset],
     before: Before,
-) -> list[Row]:
-    """Return the rows of unchanged assets, if they can be taken over; else none.
+) -> list[Row] | None:
+    """Return the rows of unchanged assets in the existing store; None if they may not stay there.
 
-    They can be if the ranges stay, no pass over the whole dataset may change the
-    rows, and the rest of what decides a store's bytes is the same.
+    `made` are the other assets. Rows stay if the parameters that decide a store's bytes do, and
+    so do the ranges with the other assets' rows.
     """
     previous, wanted = before.previous, before.wanted
     if previous is None or before.damaged or not unchanged:
-        return []
-    declared = wanted.declared
-    tables = [(one.properties, one.classes) for one in (previous.contents, declared)]
-    if tables[0] != tables[1] or {**previous.build, "name": ""} != {**wanted.build, "name": ""}:
-        return []
+        return None
+    tables = [(one.properties, one.classes) for one in (previous.contents, wanted.declared)]
+    builds = [{**one.build, "name": ""} for one in (previous, wanted)]
+    if tables[0] != tables[1] or builds[0] != builds[1]:
+        return None
     sizes, rows = np.diff(previous.offsets).tolist(), []
-    for planned in (plan[pair.asset_id] for pair in unchanged):
-        row = previous.find(planned.asset_id)
-        names, seen = planned.names, planned.seen
-        rows.append(Row(planned.asset_id, sizes[row], store=0, row=row, names=names, seen=seen))
-    everything = [*rows, *(asset for asset in made if isinstance(asset, Row))]
-    if len(everything) == len(rows) == len(previous) and not any(row.names for row in rows):
+    for one in (plan[pair.asset_id] for pair in unchanged):
+        row = previous.find(one.asset_id)
+        rows.append(Row(one.asset_id, sizes[row], store=0, row=row, names=one.names, seen=one.seen))
+    added = [asset for asset in made if isinstance(asset, Row)]
+    return rows if _may_stay(rows, added, previous, before) else None
+
+
+def _may_stay(
+    rows: Sequence[Row], added: Sequence[Row], previous: SourceStore, before: Before
+) -> bool:
+    """Return whether `rows` of the existing store stay as they are beside the `added` ones."""
+    wanted, ranges = before.wanted, before.wanted.ranges
+    # Passes, percentiles, and ranges of the objects to train on look at the voxels of all assets.
+    by_rows = not wanted.passes and (isinstance(ranges, Normalization) or ranges == "dataset")
+    if not added and len(rows) == len(previous) and not any(row.names for row in rows):
         # A build of these assets would make the same rows. Subsets and joined stores have ranges
         # and placements of other assets, unless the rows alone show that these are the same.
-        by_rows = wanted.ranges == "dataset" or isinstance(wanted.ranges, Normalization)
-        same = before.built or (by_rows and not wanted.passes)
-        return rows if same and wanted.has_ranges(previous) else []
-    if wanted.passes:
-        return []
-    ranges = wanted.ranges
-    if isinstance(ranges, str):
-        if wanted.parameters.normalize.objects != "all" or percentiles_of(ranges):
-            return []  # Such ranges depend on the values of all fields.
-        extents = column("extent", everything, (previous,))
-        ranges = ranges_from_extents(extents, ranges, declared.properties)
-    return rows if ranges == previous.normalization else []
+        return (before.built or by_rows) and wanted.has_ranges(previous)
+    if by_rows and ranges == "dataset":
+        extents = column("extent", [*rows, *added], (previous,))
+        ranges = ranges_from_extents(extents, "dataset", wanted.declared.properties)
+    return by_rows and ranges == previous.normalization
 
 
 def resolved_contents(
@@ -115,7 +117,7 @@ def resolved_contents(
     stores: Sequence[SourceStore],
     declared: Contents,
     standardised: str,
-    before: LatentSpace | None = None,
+    known: LatentSpace | None = None,
 ) -> Contents:
     """Return the contents of a store, with the latent space that `resolve_latents` finds."""
     # Sums of the same numbers in another order differ in their last digits.
@@ -123,7 +125,7 @@ def resolved_contents(
     # Annotations of one object share its SLAT, which counts once.
     counts = (row.n_voxels for row in rows)
     moments = list(dict.fromkeys(zip(counts, moments_of(rows, stores), strict=True)))
-    latents = resolve_latents(declared.latents, standardised, moments, before)
+    latents = resolve_latents(declared.latents, standardised, moments, known)
     return replace(declared, latents=latents)
 
 
@@ -152,12 +154,7 @@ def dataset_ranges(
     if (percentiles := percentiles_of(parameters.ranges)) is None:
         return ranges_from_extents([asset.columns["extent"] for asset in chosen], source, table)
     keys = list({_field_of(asset): asset.key for asset in reversed(chosen)}.values())
-    counts = _counted(spool, keys, jobs, len(table))
-    place = (counts[0].sum() - 1) * np.array(percentiles) / 100
-    upper, ranks = _at(counts, np.concatenate([np.floor(place), np.ceil(place)]).astype(int))
-    lower, _ = _at(_counted(spool, keys, jobs, len(table), upper), ranks)
-    below, above = np.split(to_mapped(_of_ranks(upper << _HALF | lower).T, table), 2)
-    lo, hi = below + (place % 1)[:, None] * (above - below)
+    lo, hi = _at_percentiles(percentiles, spool, keys, jobs, table)
     return ranges_from_bounds(lo, hi, source, table)
 
 
@@ -194,6 +191,23 @@ def _trained(
     return trained
 
 
+def _at_percentiles(
+    at: Sequence[float], spool: Spool, keys: Sequence[str], jobs: Jobs, table: Sequence[Property]
+) -> NDArray[np.float64]:
+    """Return the properties of all fields' voxels at two percentiles, (2, P), in mapped units.
+
+    Two passes find the value of any rank, in memory that does not grow with the number of values.
+    The first counts values by the upper half of their bits, which sort like the values. The second
+    counts those that share the upper half of a wanted rank, by their lower half.
+    """
+    counts = _counted(spool, keys, jobs, len(table))
+    place = (counts[0].sum() - 1) * np.array(at) / 100
+    upper, ranks = _at(counts, np.concatenate([np.floor(place), np.ceil(place)]).astype(int))
+    lower, _ = _at(_counted(spool, keys, jobs, len(table), upper), ranks)
+    below, above = np.split(to_mapped(_of_ranks(upper << _HALF | lower).T, table), 2)
+    return np.asarray(below + (place % 1)[:, None] * (above - below), np.float64)
+
+
 def _counted(
     spool: Spool,
     keys: Sequence[str],
@@ -213,11 +227,10 @@ def _counted(
 def count_halves(
     spool: Spool, key: str, upper: NDArray[np.uint32] | None
 ) -> list[tuple[NDArray[np.uint32], NDArray[np.int64]]]:
-    """Count a field's values by one half of their bits, which sort like the values.
+    """Count a field's values by one half of their bits, see `_at_percentiles`.
 
     Without `upper`, count each property's values by their upper 16 bits. Otherwise, for each upper
-    half in `upper` (P, R), count the property's values that have it by their lower 16 bits. So two
-    passes find the value of any rank, in memory that does not grow with the number of values.
+    half in `upper` (P, R), count the property's values that have it by their lower 16 bits.
     """
     bits = _in_order(spool.field(key).properties).T
     if upper is None:
@@ -250,5 +263,5 @@ def _at(
     """
     ends = counts.cumsum(axis=-1)
     values = (ends <= ranks[..., None]).sum(axis=-1)
-    before = np.take_along_axis(ends - counts, values[..., None], axis=-1)[..., 0]
-    return values.astype(np.uint32), ranks - before
+    smaller = np.take_along_axis(ends - counts, values[..., None], axis=-1)[..., 0]
+    return values.astype(np.uint32), ranks - smaller

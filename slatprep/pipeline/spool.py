@@ -38,6 +38,7 @@ from slatprep.store.record import AssetRecord
 from slatprep.store.record_json import columns_of, digest_of, read_record, to_json
 
 Arrays = dict[str, NDArray[Any]]
+"""Arrays, or rows of them, by name."""
 
 _ANNOTATION = tuple(field.name for field in fields(Annotation))
 _TORN = (OSError, ValueError, KeyError, StoreError)
@@ -130,9 +131,8 @@ class Spool:
         with self._open(key) as arrays:
             text, field, voxels = arrays["record"].tobytes(), _field_in(arrays), _voxels_in(arrays)
             resolution = int(arrays["slat_resolution"])
-        latents = StructuredLatents(
-            voxels.pop("coords"), voxels.pop("feats"), resolution=resolution
-        )
+        coords, feats = voxels.pop("coords"), voxels.pop("feats")
+        latents = StructuredLatents(coords, feats, resolution=resolution)
         record = read_record(AssetRecord, text, str(self._path(key)))
         return record, field, latents, Annotation(**voxels)
 
