@@ -192,6 +192,7 @@ def build_store(
                     fresh=fresh,
                     rehash=rehash == 1,
                     progress=progress,
+                    note=output.note,
                 )
             _show_plan(output, plan)
             return

@@ -213,6 +213,7 @@ def plan_build(
     fresh: bool = False,
     rehash: bool = False,
     progress: Progress | None = None,
+    note: Note | None = None,
 ) -> BuildPlan:
     """Return what `build_store` would do with each asset, and why; write nothing."""
     parameters = checked(BuildParameters, parameters)
@@ -221,7 +222,7 @@ def plan_build(
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:
         spool = Spool(work_directory(place.store) / "nothing")
-    pairs = _discover(parameters, jobs)
+    pairs = _discover(parameters, jobs, note=note)
     before = look_back(place, pairs, wanted, crew, fresh, float(rehash)).checked(jobs)
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)
     plan = plan_assets(pairs, context, crew, before.known, ahead=True)

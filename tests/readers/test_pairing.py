@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.commands import run
 from support.memory import less_than
 from support.published import pack
 from support.raw_sources import COORDS, FEATS, grid, raw_grid, touch
@@ -216,6 +217,9 @@ def test_patterns_of_masks_that_name_no_file_are_told(tmp_path):
     discover(dataset.parameters(), told.append)
     without = f"{root}: 1 object without a mask (a), others with one: "
     assert told[2:] == [f"{without}their background counts as empty"]
+    roots = "--pixieverse", str(root), "--slat", str(tmp_path / "slat")
+    dry = run("build-store", *roots, "--out", str(tmp_path / "s.zarr"), "--dry-run")
+    assert "1 object without a mask (a)" in dry.stderr
     np.save(root / "a/clip_features_mask.npy", mask)
     discover(dataset.parameters(), told.append)
     # A mask that is found counts, also that of an object without a SLAT.
