@@ -124,14 +124,6 @@ def test_a_poor_fit_widens_the_search_and_says_so(monkeypatch):
     assert displacement(alignment.transform, make_transform(rotation), latents.centres) < 0.01
 
 
-def test_two_different_objects_fail_after_a_search_of_all_orientations():
-    field, latents = field_of(chair()), surface_latents(BALL)
-    alignment = align(field, latents, DEFAULT)
-    assert alignment.search == "so3"
-    assert judged(field, latents, alignment).verdict is Verdict.FAILED
-    assert min(alignment.figures.score_slat, alignment.figures.score_pixieverse) < 0.6
-
-
 def test_a_missing_part_and_a_stray_part_do_not_pull():
     solid = chair()
     latents = surface_latents(solid)
@@ -208,17 +200,6 @@ def test_any_two_small_sets_get_a_similarity(voxels, other):
     assert 0.0 <= alignment.quality.overlap <= 1.0
 
 
-def test_the_order_of_voxels_does_not_matter_and_repetition_gives_the_same_bits():
-    solid = chair()
-    latents = surface_latents(turned(solid, distinct_starts()[7].rotation))
-    shuffled = np.random.default_rng(1).permutation(latents.coords)
-    once = align(field_of(solid), latents, DEFAULT)
-    again = align(field_of(solid), latents, DEFAULT)
-    other = align(field_of(solid), replace(latents, coords=shuffled), DEFAULT)
-    assert once.transform.tobytes() == again.transform.tobytes() == other.transform.tobytes()
-    assert once.candidates == again.candidates
-
-
 def test_threads_do_not_change_a_bit(tmp_path):
     code = (
         "from support.shapes import *\n"
@@ -292,6 +273,14 @@ ENGINES = {"field": DEFAULT, "open3d": PRESETS["paper"].align,
            "small_gicp": AlignParameters(engine="small_gicp")}  # fmt: skip
 
 
+@pytest.mark.parametrize("engine", ["field", "open3d"])
+def test_repetition_gives_the_same_bits(engine):
+    latents = surface_latents(np.roll(chair(), 1, axis=0))
+    once, again = (align(field_of(chair()), latents, ENGINES[engine]) for _ in range(2))
+    assert once.transform.tobytes() == again.transform.tobytes()
+    assert once.candidates == again.candidates
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("index", [0, 9, 17])
 def test_a_quarter_turn_is_found(engine, index):
@@ -305,7 +294,7 @@ def test_a_quarter_turn_is_found(engine, index):
     assert split_transform(alignment.transform)[2] == pytest.approx(1.0, abs=1e-6)
     assert len(alignment.candidates) == 64
     if engine == "field":
-        assert alignment.search == "euler64"
+        assert alignment.search == "euler64" and alignment.margin > 0.1 and not alignment.placements
         assert alignment.quality.fitness == alignment.quality.fitness_backward == 1.0
     by_fitness = max(alignment.candidates, key=lambda c: (c.fitness, -c.inlier_rmse))
     turn = by_fitness.index if by_fitness.same_as is None else by_fitness.same_as
@@ -314,14 +303,6 @@ def test_a_quarter_turn_is_found(engine, index):
         if candidate.same_as is not None:
             twin = alignment.candidates[candidate.same_as]
             assert (candidate.fitness, candidate.inlier_rmse) == (twin.fitness, twin.inlier_rmse)
-
-
-def test_the_paper_s_protocol_gives_the_same_bits_again():
-    solid = chair()
-    latents = surface_latents(np.roll(solid, 1, axis=0))
-    once, again = (align(field_of(solid), latents, PRESETS["paper"].align) for _ in range(2))
-    assert once.transform.tobytes() == again.transform.tobytes()
-    assert once.candidates == again.candidates
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from support.shapes import GRID, chair, crate
 
 from slatprep.align import search
 from slatprep.align.consensus import degrees_between
-from slatprep.align.finish import MOST_CONTESTED, finish
+from slatprep.align.finish import MOST_CONTESTED, finish, rank_of
 from slatprep.align.pair import (
     DISTINCT,
     FINE,
@@ -30,6 +30,7 @@ from slatprep.align.pose import Pose, Similarity
 from slatprep.align.starts import distinct_starts
 from slatprep.align.surface import Surface, surface_of
 from slatprep.parameters import AlignParameters
+from slatprep.records import FitFigures
 
 Array = NDArray[np.float64]
 
@@ -210,6 +211,17 @@ def test_a_scale_that_is_not_one_is_kept_and_one_that_is_nearly_one_is_not():
     np.testing.assert_allclose(same.similarity.shift, 0.0, atol=0.02)
 
 
+def test_a_scale_is_taken_away_about_the_centroid_and_lowers_the_rank_once_deformed():
+    pair, (pose, *_) = pair_of(), any_poses(3, 1)
+    centroid = pair.slat.points.mean(axis=0)[None]
+    same = looked_up(Pose(pair.at_scale_one(pose.similarity)), centroid)
+    np.testing.assert_allclose(same, looked_up(pose, centroid))
+    figures = FitFigures(0.9, 0.8, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), 0.0, 0.0)
+    for log, less in ((0.0, 0.0), (0.25, 0.04), (-0.5, 0.16)):
+        scaled = pose.similarity._replace(scale=np.exp(log))
+        assert rank_of(scaled, figures) == pytest.approx(0.85 - less)
+
+
 class _Watched(Pair):
     """A pair that notes how many poses each refinement was given, and their scales."""
 
@@ -268,12 +280,6 @@ def test_all_orientations_are_searched_and_a_stray_part_does_not_hide_the_placem
         assert pair.scales[:2] == [{pair.size_ratio}, {1.0}]
         # The supplement's scale was held, that of the poses by size was not.
         assert 1.0 not in {pose.similarity.scale for pose in halfway}
-
-
-def test_of_rigid_poses_none_gets_a_scale():
-    pair = pair_of(placed(0.8), placed(1.0), parameters=AlignParameters(model="rigid"))
-    refined, halfway = search.search_all(pair)
-    assert {pose.similarity.scale for pose in [*refined, *halfway]} == {1.0}
 
 
 def test_deformed_places_are_apart_from_twice_the_usual_distance_on():

@@ -112,6 +112,8 @@ def test_the_stated_rates_are_the_true_ones(mixed):
     assert found.refitted
     assert low <= truly.mean() <= high
     assert abs(found.wrong_share - truly.mean()) < 0.05
+    # Of 200 decoys none need be above a score for some wrong pair to be there.
+    assert found.rates.min() >= found.wrong_share / 201 and (found.errors.min() > 0 or not mixed)
     kept = found.rates <= 0.01
     assert truly[kept].mean() <= 0.02
     assert kept[~truly].mean() > 0.7

@@ -281,6 +281,14 @@ def test_an_engine_without_figures_has_a_larger_ball_s_offset():
     assert found.within[0] > 0.4 and found.roughness == pytest.approx(1.0, abs=0.2)
 
 
+def test_what_one_side_alone_has_counts_against_it_unless_it_is_ground():
+    field, latents = field_of(ball(18.0) | (GRID[..., 2] < 8)), surface_latents(ball(18.0))
+    ground = records.Ground(np.array([0.0, 0.0, 1.0]), -24 / 64)
+    both, above = (measure_figures(field, latents, replace(fitted(), ground=g)).agreement
+                   for g in (None, ground))  # fmt: skip
+    assert min(both.within_slat[2], *above.within_pixieverse) > 0.9 > both.within_pixieverse[2]
+
+
 def test_an_engine_without_figures_has_those_of_a_shifted_ball():
     """Archimedes: heights on a sphere are even; from each follows how far off the other one is."""
     field, latents = field_of(ball(18.0)), surface_latents(ball(18.0, 35.5))
