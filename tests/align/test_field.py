@@ -273,12 +273,24 @@ ENGINES = {"field": DEFAULT, "open3d": PRESETS["paper"].align,
            "small_gicp": AlignParameters(engine="small_gicp")}  # fmt: skip
 
 
+def test_two_different_objects_fail_after_a_search_of_all_orientations():
+    field, latents = field_of(chair()), surface_latents(BALL)
+    alignment = align(field, latents, DEFAULT)
+    assert alignment.search == "so3"
+    assert judged(field, latents, alignment).verdict is Verdict.FAILED
+    assert min(alignment.figures.score_slat, alignment.figures.score_pixieverse) < 0.6
+
+
 @pytest.mark.parametrize("engine", ["field", "open3d"])
-def test_repetition_gives_the_same_bits(engine):
+def test_repetition_gives_the_same_bits_and_the_order_of_voxels_does_not_matter(engine):
     latents = surface_latents(np.roll(chair(), 1, axis=0))
     once, again = (align(field_of(chair()), latents, ENGINES[engine]) for _ in range(2))
     assert once.transform.tobytes() == again.transform.tobytes()
     assert once.candidates == again.candidates
+    if engine == "field":
+        shuffled = replace(latents, coords=np.random.default_rng(1).permutation(latents.coords))
+        other = align(field_of(chair()), shuffled, DEFAULT)
+        assert other.transform.tobytes() == once.transform.tobytes()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
