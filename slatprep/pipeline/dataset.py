@@ -331,7 +331,7 @@ def _publish(
 def _measured(
     summary: BuildSummary, before: Before, made: int, decoys: int, crew: Crew
 ) -> BuildSummary:
-    """Measure the errors of the store that was written; add a warning to the summary if not.
+    """Measure the errors of the store that was written; if that fails, the summary has a warning.
 
     `made` is the number of its assets that the plan did not find in the existing store.
     """

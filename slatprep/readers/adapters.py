@@ -61,7 +61,10 @@ class SourceAdapter(Protocol):
         return find_by_pattern(patterns_of(self, source), listing, chosen_sample(source))
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
-        """Read the field at ``pair.grid`` in SI units; raise `InputError` if that fails."""
+        """Read the field at ``pair.grid``; raise `InputError` if that fails.
+
+        Its values are in SI units; those of a field that is not `converted` may be in stated units.
+        """
 
 
 class LatentAdapter(Protocol):

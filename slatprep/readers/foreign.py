@@ -16,7 +16,7 @@ import orjson
 from annotated_types import MaxLen, MinLen
 
 from slatprep import records
-from slatprep.errors import ConfigError, InputError, SlatprepError
+from slatprep.errors import InputError, SlatprepError
 from slatprep.geometry.frames import split_transform
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
@@ -95,7 +95,7 @@ class ForeignSource(_Foreign):
             return tuple(map(str, self.adapter.patterns))
 
     def describe(self, source: PixieverseSource) -> Any:
-        """Return what the source holds; ConfigError if its units are stated as logarithms."""
+        """Return what the source holds."""
         with self._blamed():
             held = self.adapter.describe(source)
             classes = held.classes
@@ -109,11 +109,7 @@ class ForeignSource(_Foreign):
             named = all(CLASS_NAME.fullmatch(one) for one in classes)
             few = classes == records.MATERIAL_CLASSES or len(classes) <= records.MANY_BACKGROUND
             self._require(named and few, f"classes {classes!r}")
-        for name, unit in vars(source.units).items():
-            if unit.startswith(records.LOG10):  # The adapter would have taken means of them.
-                what = f"{name} in {unit!r}, and the adapter {self.name!r} is another package's"
-                raise ConfigError(f"units: {what}; expected a unit without log10, or SI values")
-        return held
+            return held
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[Any]:
         """Yield its fields."""
@@ -131,13 +127,9 @@ class ForeignSource(_Foreign):
             yield found
 
     def read(self, pair: records.AssetPair, max_unphysical: float) -> records.MaterialField:
-        """Read a field, check it, and compare its values with those of known materials.
-
-        The adapter sees no stated units, so that values are converted once: here.
-        """
-        given = replace(pair, roots=replace(pair.roots, units=records.Units(), plausibility="off"))
+        """Read a field and check it; convert and compare its values if the adapter did not."""
         with self._blamed():
-            field: records.MaterialField = self.adapter.read(given, max_unphysical)
+            field: records.MaterialField = self.adapter.read(pair, max_unphysical)
             self._require(
                 isinstance(field, records.MaterialField), f"{type(field).__name__} as a field"
             )
@@ -163,22 +155,21 @@ class ForeignSource(_Foreign):
             self._require(there.all(), "annotated voxels that are not occupied")
             labels = len(contents.labels) if field.classified else 1
             self._require(field.material.max() < labels, f"classes above {labels - 1}")
-            for one, values in zip(table, field.properties.T, strict=True):
-                self._require(one.physical(values).all(), f"values that are not {one.allowed}")
             frame = np.eye(4) if field.frame is None else np.asarray(field.frame, np.float64)
             try:
                 split_transform(frame)
             except ValueError as error:
                 raise self._fault(f"gives a frame that is refused: {error}") from None
             field = self._as_recorded(field, unphysical=Count, bounds=Any)
-        where, classes = pair.grid or pair.roots.pixieverse, contents.classes
-        values, material = field.properties.copy(), field.material if field.classified else None
-        told = require_plausible(where, values, material, table, classes, pair.roots)
-        for one, column in zip(table, values.T, strict=True):
-            if not one.physical(column).all():
-                fault = f"has {one.name} that is not {one.allowed} after the stated units"
-                raise InputError(where, fault, "SI units, or those that `units` states")
-        return replace(field, properties=values, warnings=(*field.warnings, *told))
+        if not field.converted:
+            where, values = pair.grid or pair.roots.pixieverse, field.properties.copy()
+            material = field.material if field.classified else None
+            told = require_plausible(where, values, material, table, contents.classes, pair.roots)
+            warnings = (*field.warnings, *told)
+            field = replace(field, properties=values, warnings=warnings, converted=True)
+        for one, column in zip(table, field.properties.T, strict=True):
+            self._require(one.physical(column).all(), f"values that are not {one.allowed}")
+        return field
 
 
 class ForeignLatents(_Foreign):

@@ -157,7 +157,7 @@ def _unused(pairs: Sequence[AssetPair], sources: Sequence[PixieverseSource]) -> 
                 names := {one.object_id for one in lacking if not one.problem}
             ):
                 told = f"{amount(len(names), 'object')} without a mask ({first_of(sorted(names))})"
-                yield f"{source.root}: {told}, others with one: their background counts as empty"
+                yield f"{source.root}: {told}, where background counts as empty; others have one"
 
 
 def _grids_of(

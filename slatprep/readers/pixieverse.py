@@ -129,6 +129,7 @@ class PixieVerse(SourceAdapter):
             properties=np.ascontiguousarray(properties),
             unphysical=unphysical,
             bounds=bounds,
+            converted=True,
             sources=tuple(sources),
             warnings=tuple(warnings),
         )

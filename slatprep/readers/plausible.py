@@ -253,7 +253,7 @@ def _scaled(stated: Units, truly: Mapping[str, str], part: Part) -> Part:
     scaled = {}
     for name, value in (("youngs_modulus", part.modulus), ("density", part.density)):
         was, unit = stated.of(name), truly[name]
-        # A stated logarithm is never wrong here: its values are in SI units, and stay.
+        # A stated logarithm is never questioned: its values are in SI units by now.
         scaled[name] = value if unit == was else float(to_si(value / FACTORS.get(was, 1.0), unit))
     return part._replace(modulus=scaled["youngs_modulus"], density=scaled["density"])
 

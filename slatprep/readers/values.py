@@ -100,8 +100,8 @@ def require_plausible(
         others = [one.words for one in likely[1:4]]
         guess = likely[0].words + (f" (or {', or '.join(others)})" if others else "")
         what = f"the values look like {guess}: {what}"
-        advice = f"SI units, in the documented order; {likely[0].setting}"
-        advice += "; check which of these it is" if others else ""
+        check = "check which guess is right; " if others else ""
+        advice = f"SI units, in the documented order; {check}{likely[0].setting}"
     if roots.plausibility == "warn":
         return [oddity("values", f'{what}; taken as they are (plausibility = "warn")')]
     raise InputError(

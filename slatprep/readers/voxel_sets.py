@@ -105,6 +105,7 @@ def field_of_voxels(
         table=tuple(table),
         frame=frame,
         classified=material is not None,
+        converted=True,
     )
 
 

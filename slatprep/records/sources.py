@@ -117,7 +117,7 @@ def to_si(values: ArrayLike, unit: str) -> NDArray[np.float64]:
 class Units:
     """Units of the values in the files of a source; empty if they are not stated.
 
-    The checks of plausibility do not question a stated unit.
+    The checks of plausibility question a stated unit only if its values are impossible.
     """
 
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
@@ -244,6 +244,9 @@ class MaterialField:
         Transform from its frame to the SLAT frame, if the source states it.
     classified : bool
         Whether the source has classes; without them `material` is 0 throughout.
+    converted : bool
+        Whether a reader applied the stated units and compared the values with known materials. If
+        an adapter of another package did not, it is done after it.
     """
 
     occupancy: NDArray[np.bool_]
@@ -257,6 +260,7 @@ class MaterialField:
     table: tuple[Property, ...] = PROPERTIES
     frame: NDArray[np.float64] | None = None
     classified: bool = True
+    converted: bool = False
 
 
 _ODDITY = re.compile(r"(sample .+?: )?unusual (values|masks|places|latents): (.+)", re.DOTALL)

@@ -215,8 +215,8 @@ def test_patterns_of_masks_that_name_no_file_are_told(tmp_path):
     mask = dataset.assets["b"].grid[..., 3] != 7
     np.save(root / "b/clip_features_mask.npy", mask)
     discover(dataset.parameters(), told.append)
-    without = f"{root}: 1 object without a mask (a), others with one: "
-    assert told[2:] == [f"{without}their background counts as empty"]
+    without = f"{root}: 1 object without a mask (a), where background counts as empty; "
+    assert told[2:] == [f"{without}others have one"]
     roots = "--pixieverse", str(root), "--slat", str(tmp_path / "slat")
     dry = run("build-store", *roots, "--out", str(tmp_path / "s.zarr"), "--dry-run")
     assert "1 object without a mask (a)" in dry.stderr
@@ -226,7 +226,7 @@ def test_patterns_of_masks_that_name_no_file_are_told(tmp_path):
     np.save(root / "b/own.npy", mask)
     (tmp_path / "slat/b.npz").unlink()
     discover(dataset.parameters(pixieverse={"mask": ["{id}/own.npy"]}), told.append)
-    assert told[3:] == [f"{without}their background counts as empty"]
+    assert told[3:] == [f"{without}others have one"]
 
 
 def test_hdf5_with_a_group_per_asset(find, tmp_path):

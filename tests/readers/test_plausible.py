@@ -189,9 +189,9 @@ LEAVE_E, LEAVE_RHO = (f'leave units = {{ {one} }} out if' for one in (
     ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "MPa", "density": "g/cm^3"},
      "kg/m^3, not the stated g/cm^3 (or ", 'or say units = { youngs_modulus = "MPa" } in'),
     ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "GPa"},
-     "Pa, not the stated GPa (or MPa, not the stated GPa, ", f"{LEAVE_E} they are in SI units"),
+     "Pa, not the stated GPa (or MPa, not the stated GPa, ", f"is right; {LEAVE_E} they are in SI"),
     ((METAL, 2e5, 7850, 0.3), {"youngs_modulus": "GPa"},
-     "MPa, not the stated GPa (or kPa", 'order; or say units = { youngs_modulus = "MPa" } in'),
+     "MPa, not the stated GPa (or kPa", 'right; or say units = { youngs_modulus = "MPa" } in'),
     # The whole key is told, as it takes the place of the one that is there.
     ((JELLY, 2, 0.93, 0.49), {"youngs_modulus": "MPa"}, "g/cm^3 (or ",
      'or say units = { youngs_modulus = "MPa", density = "g/cm^3" } in'),
