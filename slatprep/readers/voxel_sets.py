@@ -44,9 +44,10 @@ def field_of_voxels(
     Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
     voxels' most frequent class (the lowest at a tie) and the mean properties of that class's
     voxels. The mean is in log10 for properties that are normalised in log10. InputError if there is
-    no voxel, one is out of range, or too many are unphysical. `names` are the classes' names. If a
-    file `description` states the resolution, an integer voxel may not occur twice with different
-    values. Integer voxels that fill only an eighth of the grid give a warning.
+    no voxel, one is out of range, or too many are unphysical. `names` are the classes' names, by
+    default those of `roots`. If a file `description` states the resolution, an integer voxel may
+    not occur twice with different values. Integer voxels that fill only an eighth of the grid give
+    a warning.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
@@ -68,8 +69,8 @@ def field_of_voxels(
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
-    own_or_none = None if material is None else own
-    notes += require_plausible(where, values, own_or_none, table, names, roots)
+    named, names = None if material is None else own, names or roots.contents.classes
+    notes += require_plausible(where, values, named, table, names, roots)
 
     def told(row: int, column: int) -> tuple[str, Any]:
         value = np.asarray(properties)[row, column]

@@ -20,7 +20,7 @@ from slatprep.readers.contents import latent_space
 from slatprep.readers.foreign import ForeignLatents, ForeignSource
 from slatprep.readers.pixieverse import PixieVerse
 from slatprep.readers.voxel_sets import field_of_voxels
-from slatprep.records import PROPERTIES, TRELLIS, Units
+from slatprep.records import PIXIEVERSE, PROPERTIES, TRELLIS, Units
 
 THEIRS = r"adapter 'mine' of theirs 1\.0: (gives|raises) "
 
@@ -130,15 +130,22 @@ def test_stated_units_convert_once_and_values_are_compared_after_it(make_pair, s
     assert source(read=helped).read(in_units, 0.5).unphysical == 1
 
 
-def test_a_field_in_an_eighth_of_the_grid_is_told(make_pair):
+def test_a_field_in_an_eighth_of_the_grid_and_a_class_unlike_itself_are_told(make_pair):
     block = np.indices((5, 5, 5)).reshape(3, -1).T
 
     def read(pair, max_unphysical):
-        values, files = np.tile([2e6, 930, 0.4], (125, 1)), PixieVerse().read(pair, 0.1).sources
-        return field_of_voxels(pair.grid, block, values, roots=pair.roots, sources=files)
+        values, files = np.tile([2e5, 2700, 0.4], (125, 1)), PixieVerse().read(pair, 0.1).sources
+        labels = np.full(125, PIXIEVERSE.classes.index(name))
+        return field_of_voxels(
+            pair.grid, block, values, roots=pair.roots, sources=files, material=labels
+        )
 
+    name = "jelly"
     (told,) = source(read=read).read(make_pair(), 0.1).warnings
     assert "no coordinate is above 4, as on a grid of 32^3" in told
+    name = "metal"
+    with pytest.raises(InputError, match=r"class metal has .*no metal is so soft"):
+        source(read=read).read(make_pair(), 0.1)
 
 
 @pytest.mark.parametrize("case", BAD_SLATS)
