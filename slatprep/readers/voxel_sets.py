@@ -69,8 +69,9 @@ def field_of_voxels(
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
-    named, names = None if material is None else own, names or roots.contents.classes
-    notes += require_plausible(where, values, named, table, names, roots)
+    labelled = None if material is None else own
+    names = names or roots.contents.classes
+    notes += require_plausible(where, values, labelled, table, names, roots)
 
     def told(row: int, column: int) -> tuple[str, Any]:
         value = np.asarray(properties)[row, column]

@@ -144,7 +144,7 @@ def test_what_is_absent_is_told_by_how_far_its_path_leads(tmp_path, monkeypatch)
     (tmp_path / "dang").symlink_to("nowhere")
     (tmp_path / "far").symlink_to(os.fsdecode(b"\xff"))
     (tmp_path / ".cups").mkdir()
-    nowhere = "is a link that leads nowhere (nowhere)"
+    nowhere, no_unicode = "is a link that leads nowhere (nowhere)", tmp_path / "\ufffd"
     for path, said in [
         ("dang", f"{tmp_path / 'dang'} does not exist; {tmp_path / 'dang'} {nowhere}"),
         ("dang/x", f"{tmp_path / 'dang/x'} does not exist; {tmp_path / 'dang'} {nowhere}"),
@@ -152,15 +152,14 @@ def test_what_is_absent_is_told_by_how_far_its_path_leads(tmp_path, monkeypatch)
         ("a" * 300, "cannot be looked for"),
         ("dung", f"{tmp_path} does, and holds the folders (none)"),
         ("cups", f"{tmp_path} does, and holds the folders (none)"),
-        ("\udcff", "'\ufffd' does not exist"),
+        ("\udcff", f"{no_unicode} does not exist"),
     ]:
         error = " ".join(run("info", "--json", str(tmp_path / path), code=2).stderr.split())
-        assert said.replace("'\ufffd'", str(tmp_path / "\ufffd")) in error
+        assert said in error
     for k in range(1000):
         (tmp_path / f"{k:03}").mkdir()
-    assert f"{tmp_path} does, and holds the folders 000, 001, " in (
-        told := " ".join(run("info", str(tmp_path / "absent"), code=2).stderr.split())
-    )
+    told = " ".join(run("info", str(tmp_path / "absent"), code=2).stderr.split())
+    assert f"{tmp_path} does, and holds the folders 000, 001, " in told
     assert told.endswith(" and others")
     (gone := tmp_path / "gone").mkdir()
     monkeypatch.chdir(gone)
