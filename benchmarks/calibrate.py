@@ -34,7 +34,7 @@ from scipy.special import expit
 from slatprep.align.pair import TIE
 from slatprep.judge import calibration
 from slatprep.judge.confidence import voxel_figures
-from slatprep.judge.evidence import FIGURES, HARMLESS, VOXEL_FIGURES, Surroundings
+from slatprep.judge.evidence import FIGURES, HARMLESS, MEANING, VOXEL_FIGURES, Surroundings
 from slatprep.judge.model import Logistic, Term
 from slatprep.judge.verdict import THRESHOLDS
 
@@ -45,7 +45,7 @@ right placement it was not allowed to see, for levels without a miss; 50 of othe
 EMPHASIS = {GROUND: 1.5, LUMPS: 2.0, REAL: 3.0}
 """Levels that count for more than one: the made-up ones from 0 to 8 are much alike."""
 
-PLACEMENT_FIGURES = ("margin", "clear_by", "ties", "alike")
+PLACEMENT_FIGURES = tuple(name for name, one in MEANING.items() if one.shows == "placement")
 """What the second question rests on: how far the next placement lies below, and what ties."""
 
 SAME_FIGURES = tuple(name for name in FIGURES if name not in PLACEMENT_FIGURES)
@@ -54,10 +54,7 @@ SAME_FIGURES = tuple(name for name in FIGURES if name not in PLACEMENT_FIGURES)
 VOXEL_PRIOR = {"own": 0.95, "heading": 0.05}
 """The same for voxels: what is right at one of another object has no meaning."""
 
-GROWS = {"score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
-         "margin", "clear_by", "fitness", "fitness_backward", "valid_share", "blocks_near",
-         "blocks_middle", "blocks_far", "slat_within_half", "slat_within_1", "slat_within_15",
-         "pixieverse_within_half", "pixieverse_within_1", "pixieverse_within_15"}  # fmt: skip
+GROWS = {name for name, figure in MEANING.items() if figure.sign > 0}
 """Figures that speak for a placement; all others speak against, where they are large."""
 
 RIGHT_LABELS = 0.9

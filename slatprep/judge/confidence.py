@@ -7,12 +7,8 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from slatprep.judge.calibration import SAME_OBJECT, VOXEL
-from slatprep.judge.evidence import FIGURES, Surroundings
+from slatprep.judge.evidence import MEANING, Surroundings
 from slatprep.judge.model import FLOOR
-
-_OF_SHAPE = {"moved", "moved_most", "bending", "stretch", "scale", "within_2", "within_3",
-             "score_similarity", "ground", "directions_worst", "blocks_far"}  # fmt: skip
-"""Figures that show another object by its shape; the others show it by a rough fit."""
 
 
 def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
@@ -22,8 +18,10 @@ def causes_of_doubt(evidence: NDArray[np.float64]) -> dict[str, float]:
     a usual right placement.
     """
     taken = {"shape": 0.0, "roughness": 0.0}
-    for name, added in zip(FIGURES, SAME_OBJECT.contributions(evidence).tolist(), strict=True):
-        taken["shape" if name in _OF_SHAPE else "roughness"] -= min(added, 0.0)
+    added = SAME_OBJECT.contributions(evidence).tolist()
+    for figure, own in zip(MEANING.values(), added, strict=True):
+        if figure.shows in taken:
+            taken[figure.shows] -= min(own, 0.0)
     return dict(sorted(taken.items(), key=lambda item: -item[1]))
 
 

@@ -25,7 +25,7 @@ from scipy.special import expit
 
 from slatprep.geometry.frames import Array
 from slatprep.judge.calibration import SAME_OBJECT
-from slatprep.judge.evidence import FIGURES
+from slatprep.judge.evidence import FIGURES, MEANING
 from slatprep.judge.verdict import LEAST_DECOYS, LEAST_TARGETS
 from slatprep.judge.witness import fold_of
 
@@ -46,11 +46,8 @@ LIKE_DECOYS = 0.3
 DRAWS, LIKELY = 4_000, (0.025, 0.975)
 """Number of draws for an interval, and the quantiles at its ends."""
 
-LEARNED = {"directions_near": -1, "directions_middle": -1, "directions_worst": -1,
-           "blocks_near": 1, "blocks_middle": 1, "blocks_far": 1, "slat_within_1": 1,
-           "pixieverse_within_1": 1, "moved": -1, "bending": -1, "stretch": -1,
-           "valid_share": 1}  # fmt: skip
-"""Figures whose weight a dataset may change; 1 if right pairs have larger values, -1 if smaller."""
+LEARNED = {name: figure.sign for name, figure in MEANING.items() if figure.learned}
+"""Figures whose weight a dataset may change, and their signs."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +15,45 @@ from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import UNANNOTATED, Alignment, Annotation, MaterialField, StructuredLatents
 from slatprep.sample import TOLERANCE, same_within, voxel_index_of
 
-FIGURES = (
-    "score_slat", "score_pixieverse", "score_similarity", "within_1", "within_2", "within_3",
-    "moved", "moved_most", "bending", "stretch", "scale", "offset",
-    "margin", "clear_by", "ties",
-    "fitness", "fitness_backward",
-    "valid_share", "distance", "depth", "alike", "ground",
-    "directions_near", "directions_middle", "directions_worst",
-    "blocks_near", "blocks_middle", "blocks_far",
-    "slat_within_half", "slat_within_1", "slat_within_15",
-    "pixieverse_within_half", "pixieverse_within_1", "pixieverse_within_15",
-)  # fmt: skip
-"""Names of an alignment's figures, in the order of `evidence_of`."""
+
+class Figure(NamedTuple):
+    """What a figure of an alignment says, and who may weigh it.
+
+    Attributes
+    ----------
+    sign : int
+        1 if right pairs have larger values, -1 if smaller ones.
+    shows : str
+        What a bad value speaks of: another object's ``shape``, a fit's ``roughness``, or another
+        ``placement``.
+    learned : bool
+        Whether the decoys of a dataset may change its weight; see `slatprep.judge.decoys`.
+    """
+
+    sign: int
+    shows: str = "roughness"
+    learned: bool = False
+
+
+MEANING = {
+    "score_slat": Figure(1), "score_pixieverse": Figure(1), "score_similarity": Figure(1, "shape"),
+    "within_1": Figure(1), "within_2": Figure(1, "shape"), "within_3": Figure(1, "shape"),
+    "moved": Figure(-1, "shape", learned=True), "moved_most": Figure(-1, "shape"),
+    "bending": Figure(-1, "shape", learned=True), "stretch": Figure(-1, "shape", learned=True),
+    "scale": Figure(-1, "shape"), "offset": Figure(-1), "margin": Figure(1, "placement"),
+    "clear_by": Figure(1, "placement"), "ties": Figure(-1, "placement"), "fitness": Figure(1),
+    "fitness_backward": Figure(1), "valid_share": Figure(1, learned=True), "distance": Figure(-1),
+    "depth": Figure(-1), "alike": Figure(-1, "placement"), "ground": Figure(-1, "shape"),
+    "directions_near": Figure(-1, learned=True), "directions_middle": Figure(-1, learned=True),
+    "directions_worst": Figure(-1, "shape", learned=True), "blocks_near": Figure(1, learned=True),
+    "blocks_middle": Figure(1, learned=True), "blocks_far": Figure(1, "shape", learned=True),
+    "slat_within_half": Figure(1), "slat_within_1": Figure(1, learned=True),
+    "slat_within_15": Figure(1), "pixieverse_within_half": Figure(1),
+    "pixieverse_within_1": Figure(1, learned=True), "pixieverse_within_15": Figure(1),
+}  # fmt: skip
+"""Every figure of an alignment by name; `evidence_of` has their values in this order."""
+
+FIGURES = tuple(MEANING)
 
 RADII = (1, 2, 4, 7)
 """Distances [voxel] at which the classes around a voxel's position are compared."""
@@ -34,14 +62,8 @@ VOXEL_FIGURES = (
     *(f"others_{radius}" for radius in RADII),
     *(f"others_{radius}_rough" for radius in RADII),
     *(f"others_{radius}_unsure" for radius in RADII),
-    "distance",
-    "depth",
-    "moved",
-    "asset_unsure",
-    "asset_rough",
-    "asset_distance",
-    "asset_moved",
-)
+    "distance", "depth", "moved", "asset_unsure", "asset_rough", "asset_distance", "asset_moved",
+)  # fmt: skip
 """Names of a voxel's figures, in the order of `confidence.voxel_figures`."""
 
 MARGIN_CAP = 0.3
