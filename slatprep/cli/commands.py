@@ -127,10 +127,14 @@ class LazyGroup(click.Group):
             )
         except OSError as error:
             # A disk or an object store failed at a place without a message of its own.
-            if error.filename is None:
+            if error.filename is None and error.errno != errno.ENOENT:
                 raise
-            advice = "give a shorter name" if error.errno == errno.ENAMETOOLONG else "run again"
-            say(f"slatprep: error: {error.filename}: {error.strerror}; {advice}", err=True)
+            place, advice = error.filename, "run again"
+            if place is None:  # `os.getcwd` alone names no file that it did not find.
+                place, advice = "working folder", "change to one that exists"
+            elif error.errno == errno.ENAMETOOLONG:
+                advice = "give a shorter name"
+            say(f"slatprep: error: {place}: {error.strerror}; {advice}", err=True)
             ctx.exit(output.EXIT_INCOMPLETE)
         except KeyboardInterrupt as stop:
             told = str(stop) or getattr(ctx.obj, "if_stopped", output.NOTHING_REPLACED)

@@ -165,6 +165,8 @@ def test_what_is_absent_is_told_by_how_far_its_path_leads(tmp_path, monkeypatch)
     monkeypatch.chdir(gone)
     gone.rmdir()
     assert "cannot be looked for" in run("info", "x", code=2).stderr
+    stored = ("build-store", "--pixieverse", "a", "--slat", "b", "--out", str(tmp_path / "s.zarr"))
+    assert "working folder" in run(*stored, code=1).stderr
 
 
 def test_a_misspelt_command_is_told_with_the_one_meant():
