@@ -60,7 +60,7 @@ class Difficulty:
     @property
     def has_places(self) -> bool:
         """Whether the truth gives a place for each SLAT voxel."""
-        return self.generated or self.nerf
+        return self.generated or self.nerf or self.warp > 0.0
 
 
 LEVELS: dict[int, Difficulty] = {

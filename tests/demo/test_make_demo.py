@@ -73,7 +73,7 @@ def test_layout_is_that_of_the_real_data(demo):
             assert np.array_equal(truth["transform"], entry["rows"][0]["transform"])
             for name in ("name", "level", "symmetric"):
                 assert truth[name].item() == entry[name]
-            assert "places" not in truth
+            assert ("places" in truth) == (entry["level"] == 4)
         is_good = {"vlm_filtering": {"is_appropriate": True}}
         assert metadata[uid] == {"obj_class": entry["category"]} | is_good
 
