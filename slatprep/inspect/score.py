@@ -3,8 +3,9 @@
 The truth of an asset is ``<truth_dir>/<asset id>.npz`` with ``transform`` (4, 4), ``material``
 (N,), ``name``, ``level`` and ``symmetric``. If the two shapes differ, it also has ``places``
 (N, 3), the true place of each SLAT voxel in the PixieVerse frame; ``transform`` is then the
-similarity nearest to these places, or that without the warp of level 4. In a store without classes, a voxel is right if its
-properties equal the true ``properties`` (N, P), with a column for each name in ``columns`` (P,).
+similarity nearest to these places, or that without the warp of level 4. In a store without
+classes, a voxel is right if its properties equal the true ``properties`` (N, P), with a column for
+each name in ``columns`` (P,).
 """
 
 from __future__ import annotations

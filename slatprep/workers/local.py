@@ -21,7 +21,7 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import ConfigError, SlatprepError
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -81,16 +81,28 @@ def run_unordered(
     thread. After a worker is killed, the tasks under way run again at the end, one at a time. If a
     task then kills its worker again, ``died(*task)`` gives its result; without `died`, it is a
     SlatprepError. Workers must be able to import `function`; with 1 job it runs in this process.
+    ConfigError, before any task begins, if there is no worker.
     """
+    _require_workers(jobs)
     if not isinstance(jobs, int):
-        yield from jobs.run_unordered(function, tasks, died)
-    elif jobs == 1:
-        for task in tasks:
-            with single_threaded():
-                result = function(*task)
-            yield result
-    else:
-        yield from run_in_pools(_Processes(jobs), _Processes(1), function, tasks, died)
+        return jobs.run_unordered(function, tasks, died)
+    if jobs == 1:
+        return _run_here(function, tasks)
+    return run_in_pools(_Processes(jobs), _Processes(1), function, tasks, died)
+
+
+def _run_here(
+    function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]]
+) -> Iterator[Result]:
+    for task in tasks:
+        with single_threaded():
+            result = function(*task)
+        yield result
+
+
+def _require_workers(jobs: Jobs) -> None:
+    if not hasattr(jobs, "run_unordered") and (not isinstance(jobs, int) or jobs < 1):
+        raise ConfigError(f"jobs is {jobs!r}; expected a whole number from 1, or other workers")
 
 
 def start_early(function: Callable[..., Any], jobs: Jobs) -> None:
@@ -132,12 +144,14 @@ def _numbered(
 
 def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
     """Raise `SlatprepError` unless all workers see these files; local ones always do."""
+    _require_workers(jobs)
     if not isinstance(jobs, int):
         jobs.require_shared(paths)
 
 
 def at_most(most: int, jobs: Jobs) -> Jobs:
     """Limit a number of processes to `most`, but to at least one; leave other workers alone."""
+    _require_workers(jobs)
     return max(1, min(jobs, most)) if isinstance(jobs, int) else jobs
 
 

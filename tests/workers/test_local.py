@@ -11,9 +11,17 @@ from typing import Any
 import pytest
 from support.dask_processes import threads_for_workers
 
-from slatprep.errors import SlatprepError
+from slatprep.errors import ConfigError, SlatprepError
 from slatprep.workers.dask import Cluster
-from slatprep.workers.local import Jobs, Pool, run_in_pools, run_unordered, single_threaded
+from slatprep.workers.local import (
+    Jobs,
+    Pool,
+    at_most,
+    require_shared,
+    run_in_pools,
+    run_unordered,
+    single_threaded,
+)
 
 
 @pytest.fixture(scope="module", params=[1, 2, "cluster"])
@@ -29,6 +37,17 @@ def jobs(request: pytest.FixtureRequest) -> Iterator[Jobs]:
 def test_every_task_is_done_once(jobs):
     results = run_unordered(divmod, ((n, 7) for n in range(5000)), jobs)
     assert sorted(results) == sorted(divmod(n, 7) for n in range(5000))
+
+
+@pytest.mark.parametrize("jobs", [0, -1, 1.5, None])
+def test_without_workers_nothing_seems_done(jobs):
+    for call in (
+        lambda: run_unordered(abs, [(1,)], jobs),
+        lambda: at_most(3, jobs),
+        lambda: require_shared(jobs, []),
+    ):
+        with pytest.raises(ConfigError, match=f"jobs is {jobs}; expected a whole number"):
+            call()
 
 
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
