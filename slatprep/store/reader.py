@@ -245,10 +245,7 @@ class Store(AssetTable):
         StoreError
             If there is no such asset, or its rows are invalid.
         """
-        index = number_of(index)
-        if not -len(self) <= index < len(self):
-            raise StoreError(f"{self.path} has no asset {index}; it has {len(self)} assets")
-        index %= len(self)
+        index = number_of(index, len(self), self.path)
         start, stop = self.offsets[index : index + 2].tolist()
         if not 0 <= start <= stop <= start + MAX_VOXELS:
             raise StoreError(
