@@ -317,7 +317,7 @@ class _ObjectStore(Storage):
         return self.place.open("rb")
 
     def read(self, limit: int, asked: Place | None = None) -> bytes:
-        return RemoteFile(self.place).pread(limit + 1, 0)
+        return RemoteFile(self.place).upto(limit)
 
     def state(self, states: States) -> Noted:
         return None
