@@ -209,7 +209,7 @@ def publish(
             data,
             stated=Stated(**vars(stated)),
             pictures=drawn,
-            verdicts=verdicts,
+            verdicts=chosen,
             progress=progress,
         )
     if summary.missing:

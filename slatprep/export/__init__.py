@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple
@@ -72,7 +72,7 @@ class ExportSummary:
     files: int
     size: int
     seconds: float
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...]
 
 
 def export_store(

@@ -196,9 +196,12 @@ WriteOne = Callable[[Path, StoredAsset], Exported]
 """Writes an asset into a folder."""
 
 
-def one_by_one(write: WriteOne) -> Writer:
-    """Return a writer of one file for each asset, which `write` puts into a folder."""
-    return Writer(partial(_write_each, write))
+def one_by_one(write: WriteOne, **others: Any) -> Writer:
+    """Return a writer of one file for each asset, which `write` puts into a folder.
+
+    `others` are the other fields of `Writer`.
+    """
+    return Writer(partial(_write_each, write), **others)
 
 
 def _write_each(

@@ -14,7 +14,6 @@ import csv
 import io
 import tarfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -58,8 +57,7 @@ def trellis(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
         raise ConfigError(
             f"latent_model is {model!r}; expected an encoder's name, of letters, digits, . _ and -"
         )
-    each = one_by_one(partial(write_latents, model))
-    return replace(each, finish=partial(write_metadata, model))
+    return one_by_one(partial(write_latents, model), finish=partial(write_metadata, model))
 
 
 def write_latents(model: str, directory: Path, asset: StoredAsset) -> Exported:
@@ -163,7 +161,7 @@ FOLDER = "voxels"
 def voxel_data(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     """Return the writer of an npz for each asset; see `slatprep.export.FORMATS`."""
     points = options.points or "slat"
-    return replace(one_by_one(partial(write_voxels, points)), points=points)
+    return one_by_one(partial(write_voxels, points), points=points)
 
 
 def write_voxels(points: Points, directory: Path, asset: StoredAsset) -> Exported:

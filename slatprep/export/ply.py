@@ -7,7 +7,6 @@ of PhysGaussian loads (``load_point_cloud``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -62,7 +61,7 @@ def writer(store: Store, ids: Sequence[str], options: ExportOptions) -> Writer:
     bounds, notes = read_bounds(store, ids) if options.frame == "pixieverse" else ({}, ())
     points = options.points or "slat"
     one = partial(write, points, options.frame, bounds)
-    return replace(one_by_one(one), points=points, remarks=lambda _entries: notes)
+    return one_by_one(one, points=points, remarks=lambda _entries: notes)
 
 
 def write(

@@ -9,7 +9,7 @@ import html
 import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from slatprep.errors import ConfigError, StoreError, printable, row_of_category
 from slatprep.export import croissant, export_store, target
 from slatprep.export.croissant import Stated
-from slatprep.records import USABLE, Place, Verdict
+from slatprep.records import Verdict
 from slatprep.storage.files import file_digest, local_files
 from slatprep.storage.place import storage_of
-from slatprep.store import Store, open_store
+from slatprep.store import Store
 from slatprep.store.integrity import file_findings
 from slatprep.store.reader import require_outside
+from slatprep.workers import Progress
 
 Data = Literal["store", "webdataset"]
 
@@ -46,48 +47,45 @@ class PublishSummary:
 
 
 def publish_store(
-    store: Store | str | Place,
+    store: Store,
     out: Path,
-    data: Data = "store",
+    data: Data,
     *,
-    stated: Stated | None = None,
-    pictures: Mapping[str, bytes] | None = None,
-    verdicts: Sequence[str] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    stated: Stated,
+    pictures: Mapping[str, bytes],
+    verdicts: Sequence[str],
+    progress: Progress,
 ) -> PublishSummary:
     """Write a store of the local disk, or WebDataset shards of it, as a dataset for a hub.
 
-    `pictures` for the card are PNG bytes by file name; for shards, `verdicts` and `progress` are as
-    in `slatprep.export.export_store`. ConfigError if the store is not local, or `out` lies in one
-    or holds other files. StoreError if a file differs from its digest.
+    `pictures` for the card are PNG bytes by file name. Shards have the assets with one of
+    `verdicts`, and `progress` tells of them. ConfigError if the store is not local, or `out` lies
+    in one or holds other files. StoreError if a file differs from its digest.
     """
-    opened, stated, out = open_store(store), stated or Stated(), Path(out)
-    local = storage_of(opened.path).local
+    local = storage_of(store.path).local
     if local is None:
         raise ConfigError(
-            f"{opened.path} is on no local disk; `slatprep subset {opened.path} --verdict all "
+            f"{store.path} is on no local disk; `slatprep subset {store.path} --verdict all "
             "--out FOLDER` makes a store there that can be published"
         )
     require_outside(out)
-    assets = len(opened)
-    chosen: Sequence[str] = ()
+    assets = len(store)
     with target.directory(out, "hub") as folder:
         if data == "store":
-            where = opened.name
-            _copy(opened, local, folder / where)
+            where = store.name
+            _copy(store, local, folder / where)
             # For shards, hubs generate a description themselves.
             described = replace(stated, license=stated.license_url)
-            document = croissant.describe(opened, described, where)
+            document = croissant.describe(store, described, where)
             (folder / DESCRIPTION).write_text(croissant.to_json(document), encoding="utf-8")
         else:
             where = f"{SHARDS}/*.tar"
-            chosen = USABLE if verdicts is None else verdicts
             assets = export_store(
-                opened, folder / SHARDS, "webdataset", verdicts=chosen, progress=progress
+                store, folder / SHARDS, "webdataset", verdicts=verdicts, progress=progress
             ).assets
-        for name, content in (pictures or {}).items():
+        for name, content in pictures.items():
             (folder / name).write_bytes(content)
-        card = card_of(opened, stated, where, list(pictures or ()), chosen)
+        card = card_of(store, stated, where, list(pictures), verdicts)
         (folder / CARD).write_text(card, encoding="utf-8")
         names = list(local_files(folder))
         lines = (f"{file_digest(folder / name)}  {name}\n" for name in names)
@@ -95,7 +93,7 @@ def publish_store(
         names.append(CHECKSUMS)
         size = sum((folder / name).stat().st_size for name in names)
         about = {"format": target.FORMAT, "format_version": target.FORMAT_VERSION,
-                 "kind": "hub", "store": opened.name, "manifest": opened.about.manifest,
+                 "kind": "hub", "store": store.name, "manifest": store.about.manifest,
                  "files": names}  # fmt: skip
         target.write_index(folder, about, [])
     return PublishSummary(out, where, assets, len(names), size, stated.missing)

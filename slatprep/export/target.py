@@ -37,9 +37,7 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
     out = out.resolve()
     # The finished assets of an interrupted build to this path stay.
     with scratch_beside(out, "export") as scratch, writing(str(out), out.parent):
-        own = _files_of_export(out, kind) if out.exists() else frozenset()
-        if own is None:
-            raise _not_an_export(out, "folder")
+        own = _files_of_export(out, kind)
         new = scratch / "export"
         new.mkdir()
         yield new
@@ -72,24 +70,22 @@ def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, A
     (path / INDEX).write_bytes(head + b',\n  "assets": [\n    ' + rows + b"\n  ]\n}\n")
 
 
-def _files_of_export(out: Path, kind: str) -> frozenset[str] | None:
-    """Return the names of an export's files and folders; None if `out` is not an export.
+def _files_of_export(out: Path, kind: str) -> frozenset[str]:
+    """Return the names of an export's files and folders; none if there is nothing.
 
-    ConfigError if it is an export of another kind, which the user hardly wants to lose.
+    ConfigError if it is no export, or one of another kind, which the user hardly wants to lose.
     """
-    if not out.is_dir():
-        return None
-    if not any(out.iterdir()):
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return frozenset()
     try:
         index = json.loads((out / INDEX).read_text(encoding="utf-8"))
         if index["format"] != FORMAT:
-            return None
+            raise ValueError
         there = index["kind"]
         names = [*index.get("files", ()), *(entry["file"] for entry in index["assets"])]
         files = [PurePosixPath(name) for name in names]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return None
+        raise _not_an_export(out, "folder") from None
     if there != kind:
         raise ConfigError(
             f"{out} has an export in another format, {there}; expected one in {kind} to replace, "

@@ -13,7 +13,6 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -75,7 +74,7 @@ def writer(store: Store, ids: Sequence[str], options: formats.ExportOptions) -> 
     points = options.points or "grid"
     one = partial(write, points, options.size, options.materials)
     finish = partial(write_scene, options.size)
-    return replace(formats.one_by_one(one), finish=finish, points=points, remarks=_remarks)
+    return formats.one_by_one(one, finish=finish, points=points, remarks=_remarks)
 
 
 def write(

@@ -148,10 +148,10 @@ def train(
     *,
     device: str = "cpu",
     workers: int = 0,
-    progress: Callable[[EpochRecord], None] | None = None,
-    steps: Progress | None = None,
+    progress: Callable[[EpochRecord], None] = lambda _: None,
+    steps: Progress = lambda _done, _total: None,
     stop_after: int | None = None,
-    note: Callable[[str], None] | None = None,
+    note: Callable[[str], None] = lambda _: None,
 ) -> TrainSummary:
     """Train a decoder into the folder `out`, or resume a run that was stopped.
 
@@ -186,8 +186,7 @@ def train(
         if state is not None:
             with refusing(run.path / LAST, "cannot be read", "a checkpoint of this run"):
                 session.restore(state)
-            if note:
-                note(f"resumed: from {run.path / LAST}; steps are counted from there")
+            note(f"resumed: from {run.path / LAST}; steps are counted from there")
         while not session.finished and session.epoch != stop_after:
             train_loss, rate = session.run_epoch(steps, lambda: run.save(LAST, session.state()))
             record = EpochRecord(session.epoch, rate, train_loss, *session.validate())
@@ -203,8 +202,7 @@ def train(
                 run.save(BEST, checkpoint_state(session.model, parameters.size, ranges, holds))
             run.log(session.history)
             run.save(LAST, session.state())
-            if progress is not None:
-                progress(record)
+            progress(record)
         references = {}
         if val_set is not None:
             for one in fit_baselines(opened, train_set.indices.tolist()):
@@ -312,7 +310,7 @@ class _Session:
         at_end = self.epoch >= self.epochs or without_better >= self.parameters.patience
         return at_end or self.diverged()
 
-    def run_epoch(self, steps: Progress | None, save: Callable[[], None]) -> tuple[float, float]:
+    def run_epoch(self, steps: Progress, save: Callable[[], None]) -> tuple[float, float]:
         """Train to the end of an epoch; return the mean loss and the last learning rate.
 
         `save` is called after a step of the optimiser, every `SECONDS_BETWEEN_SAVES`.
@@ -324,7 +322,7 @@ class _Session:
         batches = min(length, (self.all_steps - self.epoch * self.steps) * accumulate)
         last = min(length, (self.all_steps - (self.epochs - 1) * self.steps) * accumulate)
         total = (self.epochs - 1) * length + last - self.resumed_at
-        if steps and before + len(self.losses) == 0:
+        if before + len(self.losses) == 0:
             steps(0, total)
         saved = time.monotonic()
         for batch in islice(self.loader, batches - len(self.losses)):
@@ -343,8 +341,7 @@ class _Session:
                 if time.monotonic() - saved >= SECONDS_BETWEEN_SAVES and number + 1 < batches:
                     save()
                     saved = time.monotonic()
-            if steps:
-                steps(before + number + 1, total)
+            steps(before + number + 1, total)
         rate = self._rate(self.epoch * self.steps + (batches - 1) // accumulate)
         loss_of_epoch, self.losses = float(np.mean(self.losses)), []
         return loss_of_epoch, rate

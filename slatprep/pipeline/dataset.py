@@ -43,7 +43,7 @@ from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Normalization, Place
 from slatprep.storage.atomic import staged, writing
-from slatprep.storage.work import work_directory
+from slatprep.storage.place import storage_of
 from slatprep.store.reader import require_outside
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
@@ -221,7 +221,7 @@ def plan_build(
     crew = Crew(jobs, progress=progress)
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:
-        spool = Spool(work_directory(place.store) / "nothing")
+        spool = Spool(storage_of(place.store).work_folder() / "nothing")
     pairs = _discover(parameters, jobs, note=note)
     before = look_back(place, pairs, wanted, crew, fresh, float(rehash)).checked(jobs)
     context = BuildContext(parameters, wanted.recipe, spool, before.previous, strict=False)

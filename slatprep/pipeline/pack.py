@@ -29,7 +29,6 @@ from slatprep.storage.files import take_file
 from slatprep.storage.place import storage_of
 from slatprep.storage.remote import RemotePlace, put_objects
 from slatprep.storage.upload import Staged
-from slatprep.storage.work import work_directory
 from slatprep.store.integrity import open_for_writing
 from slatprep.store.layout import ARRAYS, RECORD_ARRAY, arrays_with, edges_of, overlaps
 from slatprep.store.runs import Run, Runs, runs_of
@@ -64,7 +63,7 @@ def pack_store(
     Equal bytes of an older store are taken over: whole shards as files, if the new store replaces
     it, and packed chunks.
     """
-    with writing(str(place.out), work_directory(place.store).parent):
+    with writing(str(place.out), storage_of(place.store).work_folder().parent):
         path = work.scratch / "store.zarr"
         staged, taken = _made(path, new, work, jobs, progress)
         place.replace(path, new.ids, staged)

@@ -29,7 +29,7 @@ from slatprep.records import Place
 from slatprep.storage.atomic import writing
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import BUILDER, SPOOL, is_spooled, new_version
-from slatprep.storage.work import refusal, scratch_beside, work_directory
+from slatprep.storage.work import refusal, scratch_beside
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def work_beside(
     at the target. StoreError as `scratch_beside`, and if, with `fresh`, another build uses the
     spool; it names that build.
     """
-    directory = work_directory(target)
+    directory = storage_of(target).work_folder()
     folder, remote = directory / SPOOL, storage_of(target).remote if private_disks else None
     spool = spool_of(target, private_disks, arrays)
     finished, work = False, None
@@ -149,7 +149,7 @@ def _clear(directory: Path, work: Work | None, all_assets: bool) -> None:
 def spool_of(target: Place, private_disks: bool, arrays: bool = True) -> Spool:
     """Return the spool of a target; see `work_beside` for the parameters."""
     remote = storage_of(target).remote if private_disks else None
-    return Spool((remote or work_directory(target)) / SPOOL, arrays)
+    return Spool((remote or storage_of(target).work_folder()) / SPOOL, arrays)
 
 
 def _mark(directory: Path) -> str:

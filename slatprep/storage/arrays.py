@@ -19,6 +19,7 @@ import orjson
 from numpy.typing import NDArray
 
 from slatprep.errors import StoreError
+from slatprep.storage.chunks import crc32c
 
 _START = struct.Struct("<8sII")
 _MARK = b"SLATARR1"
@@ -31,11 +32,11 @@ def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
     entries, parts, at = {}, [], 0
     for name, array in arrays.items():
         data = np.asarray(array, order="C").reshape(-1).view(np.uint8)
-        entries[name] = (array.dtype.str, array.shape, at, _checksum(data))
+        entries[name] = (array.dtype.str, array.shape, at, crc32c(data))
         parts.append(data)
         at += data.nbytes
     header = np.frombuffer(orjson.dumps(entries), np.uint8)
-    file.write(_START.pack(_MARK, len(header), _checksum(header)))
+    file.write(_START.pack(_MARK, len(header), crc32c(header)))
     file.writelines([header.data, *(part.data for part in parts)])
 
 
@@ -51,7 +52,7 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
         start = file.read(_START.size)
         mark, length, checksum = _START.unpack(start.ljust(_START.size))
         header = file.read(length) if mark == _MARK else b""
-        if mark != _MARK or _checksum(np.frombuffer(header, np.uint8)) != checksum:
+        if mark != _MARK or crc32c(np.frombuffer(header, np.uint8)) != checksum:
             raise StoreError("the file of arrays is damaged, or no such file")
         self._first = file.tell()
         self._entries = _entries_in(header, file.seek(0, os.SEEK_END) - self._first)
@@ -60,7 +61,7 @@ class ArrayFile(Mapping[str, NDArray[Any]]):
         dtype, shape, at, checksum = self._entries[name]
         data = np.empty(math.prod(shape) * np.dtype(dtype).itemsize, np.uint8)
         self._file.seek(self._first + at)
-        if self._file.readinto(data.data) != data.nbytes or _checksum(data) != checksum:  # type: ignore[attr-defined]
+        if self._file.readinto(data.data) != data.nbytes or crc32c(data) != checksum:  # type: ignore[attr-defined]
             raise StoreError(f"the array {name!r} is damaged")
         return np.asarray(data.view(dtype).reshape(shape))
 
@@ -93,12 +94,6 @@ def _lies_in(size: int, entry: Any) -> bool:
             whole = len(lengths) == len(shape) <= _MOST_AXES
             return whole and fits and 0 <= at <= size - item * math.prod(lengths)
     return False
-
-
-def _checksum(data: NDArray[np.uint8]) -> int:
-    import google_crc32c
-
-    return int(google_crc32c.value(data))
 
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}

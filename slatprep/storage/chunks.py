@@ -109,11 +109,16 @@ class ChunkDecoder:
         return np.asarray(VLenUTF8().decode(text))
 
 
-def crc32c_holds(data: bytes) -> bool:
-    """Return whether bytes end with the CRC32C of the bytes before."""
+def crc32c(data: bytes | NDArray[np.uint8]) -> int:
+    """Return the CRC32C of bytes (RFC 3720, section 12.1)."""
     import google_crc32c
 
-    return len(data) >= 4 and int(google_crc32c.value(data)) == _CRC32C_RESIDUE
+    return int(google_crc32c.value(data))
+
+
+def crc32c_holds(data: bytes) -> bool:
+    """Return whether bytes end with the CRC32C of the bytes before."""
+    return len(data) >= 4 and crc32c(data) == _CRC32C_RESIDUE
 
 
 def content_size(data: memoryview | bytes, compressor: str) -> int:

@@ -70,11 +70,6 @@ class LocalFolder:
         """Open a file for reading, without buffer."""
         return LocalFile(name, opener=self._open_at)
 
-    def read(self, name: str, limit: int) -> bytes:
-        """Read at most `limit` + 1 bytes of a file; the last byte shows that it is too large."""
-        with self.open(name) as file:
-            return file.upto(limit)
-
     def _open_at(self, name: str, flags: int) -> int:
         return os.open(name, flags | _NO_WAITING, dir_fd=self._descriptor)
 

@@ -263,7 +263,7 @@ class Storage:
         return staged_apart(self._path, begun)
 
     def work_folder(self) -> Path:
-        """Return the local folder for work on the place."""
+        """Return the folder for work on the place: beside it, or in the cache of a remote one."""
         return self._path.with_name(f".{self._path.name}.work")
 
 
@@ -317,7 +317,7 @@ class _ObjectStore(Storage):
         return self.place.open("rb")
 
     def read(self, limit: int, asked: Place | None = None) -> bytes:
-        return RemoteFile(self.place).pread(limit + 1, 0)
+        return RemoteFile(self.place).upto(limit)
 
     def state(self, states: States) -> Noted:
         return None

@@ -175,6 +175,10 @@ class RemoteFile(io.RawIOBase):
                 raise
             return b""  # Servers refuse a range that begins after the end.
 
+    def upto(self, limit: int) -> bytes:
+        """Read at most `limit` + 1 bytes; the last one shows that the file is too large."""
+        return self.pread(limit + 1, 0)
+
     def readall(self) -> bytes:
         """Read to the end in blocks of `BUFFER_BYTES`, because Python's own have 8 kB."""
         return b"".join(iter(lambda: self.read(BUFFER_BYTES) or b"", b""))
@@ -210,10 +214,6 @@ class RemoteFolder:
     def open(self, name: str) -> RemoteFile:
         """Open a file for reading, without a request yet."""
         return RemoteFile(self._place / name)
-
-    def read(self, name: str, limit: int) -> bytes:
-        """Read at most `limit` + 1 bytes of a file; the last byte shows that it is too large."""
-        return self.open(name).pread(limit + 1, 0)
 
 
 def stamp_of(entry: Mapping[str, Any]) -> str:

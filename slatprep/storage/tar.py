@@ -237,7 +237,6 @@ def entries(
         if member is None:
             break
         archive.members.clear()  # type: ignore[attr-defined]
-        _require_size(member)
         if member.offset_data + member.size > size and member.isreg():
             raise ArchiveError(f"ends within {member.name!r}; {INCOMPLETE}")
         check = zlib.crc32(file.held(BLOCK, member.offset_data - BLOCK))
@@ -269,7 +268,6 @@ def unpack(
             ) as archive,
         ):
             for member in archive:
-                _require_size(member)
                 entry = _entry(member, 0)
                 archive.members.clear()  # type: ignore[attr-defined]
                 if entry is None:
@@ -313,13 +311,10 @@ class _Unpacked(gzip.GzipFile):
                 pass
 
 
-def _require_size(member: tarfile.TarInfo) -> None:
-    """Raise ArchiveError if a member has a negative size, which a header before it may claim."""
-    if member.size < 0:
-        raise ArchiveError(f"has a header that claims {member.size:,} bytes; {INCOMPLETE}")
-
-
 def _entry(member: tarfile.TarInfo, check: int) -> Entry | None:
+    """Return the entry of a member, None for a folder; ArchiveError if its size is negative."""
+    if member.size < 0:  # A header before its own may claim any size.
+        raise ArchiveError(f"has a header that claims {member.size:,} bytes; {INCOMPLETE}")
     if member.isdir():
         return None
     name, problem, link = plain_name(member.name), "", ""

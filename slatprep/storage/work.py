@@ -36,16 +36,15 @@ def scratch_beside(
     `who` works there, in a word. StoreError if the folder cannot be written or is not slatprep's,
     or another process has the lock; it names that one.
     """
-    directory = work_directory(target)
-    lock = None
+    place, lock = storage_of(target), None
+    directory = place.work_folder()
     try:
         with writing(str(target), directory.parent):
             _claim(directory)
             reached("work folder made", directory.name)
             lock = take_lock(directory / LOCK, f"{target}: another {who} is writing it")
             reached("work folder locked", directory.name)
-            _restore(directory, target)
-            _remove_scratch(directory)
+            _tidy(directory, place.local)
             scratch = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=directory))
         yield scratch
     except KeyboardInterrupt:
@@ -56,8 +55,7 @@ def scratch_beside(
     finally:
         if lock is not None:
             try:
-                _restore(directory, target)
-                _remove_scratch(directory)
+                _tidy(directory, place.local)
                 clear()
                 _leave(directory)
             finally:
@@ -77,22 +75,12 @@ def _leave(directory: Path) -> None:
         directory.rmdir()
 
 
-def work_directory(target: Place) -> Path:
-    """Return the work folder of a target: beside it, or in the cache if it is on no local disk."""
-    return storage_of(target).work_folder()
-
-
 def refusal(path: Path, what: str) -> StoreError:
     """Return the error that a work folder, or what is in it, is not slatprep's."""
     return StoreError(
         f"{path}: {what}; expected a work folder of slatprep, or nothing. Move it away, or choose "
         "another path for the result"
     )
-
-
-def _restore(directory: Path, target: Place) -> None:
-    if (local := storage_of(target).local) is not None:
-        restore_directory(directory, local)
 
 
 def _claim(directory: Path) -> None:
@@ -117,6 +105,9 @@ def _claim(directory: Path) -> None:
         raise refusal(directory, f"holds {min(names)} and was not made by a build")
 
 
-def _remove_scratch(directory: Path) -> None:
+def _tidy(directory: Path, target: Path | None) -> None:
+    """Restore the target from what a killed process moved aside, then remove its folders."""
+    if target is not None:
+        restore_directory(directory, target)
     for path in directory.glob(f"{_PREFIX}*"):
         shutil.rmtree(path, ignore_errors=True)

@@ -426,7 +426,7 @@ def match_id(name: str | int, rows: Mapping[str, int], where: object, listing: s
     UnknownAssetError names `where` the ids are, and has `listing`, a hint at how to list them.
     """
     if not isinstance(name, str):
-        return _numbered(number_of(name), rows, where)
+        return number_of(name, len(rows), where)
     if name in rows:
         return rows[name]  # A loop over all assets must not search all ids each time.
     alike = [known for known in rows if known.startswith(name)] if name else []
@@ -439,18 +439,25 @@ def match_id(name: str | int, rows: Mapping[str, int], where: object, listing: s
             f"{', '.join(alike[:3])}; give more of it"
         )
     if not alike and name.isascii() and name.isdigit():
-        return _numbered(int(name), rows, where)
+        return number_of(int(name), len(rows), where)
     raise _unknown(name, rows, where, listing)
 
 
-def number_of(row: int) -> int:
-    """Return the number of a row as an int; UnknownAssetError for an entry of a mask."""
+def number_of(row: int, count: int, where: object) -> int:
+    """Return the number of one of `count` rows, counted from 0; negative ones count from the end.
+
+    UnknownAssetError, naming `where`, if there is no such row, or for an entry of a mask.
+    """
     if isinstance(row, bool | np.bool_):
         raise UnknownAssetError(
             f"{row} is an entry of a mask, not an asset; expected the rows that the mask chooses: "
             "numpy.flatnonzero(mask)"
         )
-    return operator.index(row)
+    if not -count <= (number := operator.index(row)) < count:
+        raise UnknownAssetError(
+            f"{where} has no asset {number}; it has {amount(count, 'asset')}, numbered from 0"
+        )
+    return number % count
 
 
 def other_store(path: Place) -> StoreError:
@@ -459,14 +466,6 @@ def other_store(path: Place) -> StoreError:
         f"{path}: is another store than the one that was opened (was the store replaced?); "
         "open it again"
     )
-
-
-def _numbered(number: int, rows: Mapping[str, int], where: object) -> int:
-    if not -len(rows) <= number < len(rows):
-        raise UnknownAssetError(
-            f"{where} has no asset {number}; it has {amount(len(rows), 'asset')}, numbered from 0"
-        )
-    return number % len(rows)
 
 
 def _unknown(name: str, rows: Mapping[str, int], where: object, listing: str) -> UnknownAssetError:

@@ -245,10 +245,7 @@ class Store(AssetTable):
         StoreError
             If there is no such asset, or its rows are invalid.
         """
-        index = number_of(index)
-        if not -len(self) <= index < len(self):
-            raise StoreError(f"{self.path} has no asset {index}; it has {len(self)} assets")
-        index %= len(self)
+        index = number_of(index, len(self), self.path)
         start, stop = self.offsets[index : index + 2].tolist()
         if not 0 <= start <= stop <= start + MAX_VOXELS:
             raise StoreError(
@@ -322,13 +319,7 @@ def open_store(path: Store | str | Place, *, copy: bool = False) -> Store:
     if copy:
         path = storage_of(path).copied_version()
     document, folder = _opened_root(path)
-    attributes = document.get("attributes", {})
-    if attributes.get("format") != FORMAT:
-        raise StoreError(
-            f"{path} is not a slatprep store; expected a directory that "
-            "`slatprep build-store` wrote"
-        )
-    version = attributes.get("format_version")
+    version = document["attributes"].get("format_version")
     if type(version) is not int or version != FORMAT_VERSION:
         raise StoreError(
             f"{path} has format version {version!r}; this slatprep reads {FORMAT_VERSION}. "
@@ -379,10 +370,10 @@ def opened_elsewhere(opens: Callable[..., Store], *of: object) -> Store:
 def is_store(path: Place) -> bool:
     """Return whether a place itself is a slatprep store of any format version."""
     try:
-        attributes = _opened_root(path)[0].get("attributes", {})
+        _opened_root(path)
     except StoreError:
         return False
-    return bool(attributes.get("format") == FORMAT)
+    return True
 
 
 def require_outside(out: Path, to_replace: bool = False) -> None:
@@ -414,16 +405,17 @@ def require_beside(folder: Path) -> None:
     require_outside(folder)
 
 
-def _opened_root(path: Place) -> tuple[dict[str, Any], Folder | None]:
-    """Return the root's ``zarr.json``, empty if it is not that of a store, and its folder.
+def _opened_root(path: Place) -> tuple[dict[str, Any], Folder]:
+    """Return the root's ``zarr.json`` of a store of any format version, and its folder.
 
     All files are read through that folder, as a build may put another one at the path at any time.
-    StoreError if the file does not exist or cannot be read.
+    StoreError if the file does not exist, cannot be read, or is not that of a store.
     """
     file = path / "zarr.json"
     try:
         folder = storage_of(path).folder()
-        text = bounded(folder.read("zarr.json", MAX_METADATA_BYTES), MAX_METADATA_BYTES)
+        with folder.open("zarr.json") as opened:
+            text = bounded(opened.upto(MAX_METADATA_BYTES), MAX_METADATA_BYTES)
         document = parse_document(text)
     except (FileNotFoundError, NotADirectoryError) as error:
         what = "its bucket" if "bucket does not exist" in str(error) else file
@@ -436,10 +428,15 @@ def _opened_root(path: Place) -> tuple[dict[str, Any], Folder | None]:
             f"{file}: may not be read ({error.strerror}); expected a store that these "
             "credentials may read"
         ) from None
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.EISDIR):
+    except (OSError, ValueError) as error:
+        # A pipe or a folder of that name is no store.
+        if isinstance(error, OSError) and error.errno not in (errno.EINVAL, errno.EISDIR):
             raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
-        return {}, None  # A pipe or a folder of that name is no store.
-    except ValueError:
-        return {}, None
-    return document if isinstance(document.get("attributes"), dict) else {}, folder
+        document = {}
+    attributes = document.get("attributes")
+    if not isinstance(attributes, dict) or attributes.get("format") != FORMAT:
+        raise StoreError(
+            f"{path} is not a slatprep store; expected a directory that "
+            "`slatprep build-store` wrote"
+        )
+    return document, folder

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from functools import lru_cache, partial
 from pathlib import Path
 
 from slatprep.errors import StoreError
@@ -29,7 +30,9 @@ class StoredRecords:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._chunks: dict[int, list[str]] = {}
+        # Callers ask for rows nearly in order, within each segment. A method of this object would
+        # be a cycle, and the store's files stay open until it is collected.
+        self._texts = lru_cache(_CHUNKS_KEPT)(partial(_texts_in, store))
 
     def __iter__(self) -> Iterator[AssetRecord]:
         return (self.read(row) for row in range(len(self.store)))
@@ -55,16 +58,14 @@ class StoredRecords:
     def text(self, row: int) -> str:
         """Return the record of a row as its JSON, unchecked; StoreError if it cannot be read."""
         chunk, position = divmod(row, RECORDS_IN_CHUNK)
-        # Callers ask for rows nearly in order, within each segment.
-        if (kept := self._chunks.get(chunk)) is None:
-            start = chunk * RECORDS_IN_CHUNK
-            stop = min(start + RECORDS_IN_CHUNK, len(self.store))
-            kept = [str(text) for text in self.store.read_rows(RECORD_ARRAY, start, stop)]
-            self._chunks[chunk] = kept
-            # Threads may share it, and add chunks at the same time.
-            for oldest in list(self._chunks)[:-_CHUNKS_KEPT]:
-                self._chunks.pop(oldest, None)
-        return kept[position]
+        return self._texts(chunk)[position]
+
+
+def _texts_in(store: Store, chunk: int) -> list[str]:
+    """Return the records of the rows in a chunk, as JSON."""
+    start = chunk * RECORDS_IN_CHUNK
+    stop = min(start + RECORDS_IN_CHUNK, len(store))
+    return [str(text) for text in store.read_rows(RECORD_ARRAY, start, stop)]
 
 
 BUILD, ASSETS, SEVERAL, ERRORS = "build.json", "assets.jsonl", "assets-*.jsonl", "decoys.json"

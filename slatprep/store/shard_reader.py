@@ -9,7 +9,6 @@ adjacent, so this reader reads only them; zarr-python reads the same bytes with 
 from __future__ import annotations
 
 import errno
-import threading
 import weakref
 from collections import deque
 from collections.abc import Container, Iterator, Mapping
@@ -106,7 +105,6 @@ class RowReader:
     fill_value: Any
     listed: Container[str] | None = field(default=None, init=False)
     _shards: dict[int, _Shard] = field(default_factory=dict, init=False)
-    _local: threading.local = field(default_factory=threading.local, init=False)
 
     def __post_init__(self) -> None:
         self.dtype = self.decoder.dtype
@@ -158,7 +156,7 @@ class RowReader:
             if last - first == rows:
                 self._chunk(chunk, target, ahead)
             else:
-                whole = self._scratch()
+                whole = np.empty(self.decoder.shape, self.dtype)
                 self._chunk(chunk, whole, ahead)
                 target[...] = whole[first - base : last - base]
         return out
@@ -222,13 +220,6 @@ class RowReader:
             return file.pread(length, offset)
         except OSError as error:
             raise self._unread(number, error) from None
-
-    def _scratch(self) -> NDArray[Any]:
-        """Return this thread's memory for a chunk of which only some rows are wanted."""
-        scratch: NDArray[Any] | None = getattr(self._local, "scratch", None)
-        if scratch is None:
-            scratch = self._local.scratch = np.empty(self.decoder.shape, self.dtype)
-        return scratch
 
     def _shard(self, number: int) -> _Shard:
         if (known := self._shards.get(number)) is not None:

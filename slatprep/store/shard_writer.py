@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slatprep.records import Place
 from slatprep.storage.atomic import writing
-from slatprep.storage.chunks import MISSING, single_threaded_blosc
+from slatprep.storage.chunks import MISSING, crc32c, single_threaded_blosc
 from slatprep.storage.place import storage_of
 from slatprep.store.contract import read_metadata
 from slatprep.store.shard_reader import RowReader
@@ -149,7 +149,5 @@ def _encoder(codecs: list[Mapping[str, Any]]) -> Callable[[NDArray[Any]], bytes]
 
 
 def _with_checksum(data: bytes) -> bytes:
-    import google_crc32c
-
     data = bytes(data)
-    return data + int(google_crc32c.value(data)).to_bytes(4, "little")
+    return data + crc32c(data).to_bytes(4, "little")

@@ -61,16 +61,25 @@ def test_records_that_threads_read_at_once_are_not_kept_for_ever():
             return str.__str__(self)
 
     class Rows:
+        reads = 0
+
         def __len__(self) -> int:
             return 64 * RECORDS_IN_CHUNK
 
         def read_rows(self, _: str, start: int, stop: int) -> list[Text]:
+            self.reads += 1
             return [Text(f"row {row}") for row in range(start, stop)]
 
-    records = StoredRecords(Rows())
+    rows = Rows()
+    records = StoredRecords(rows)
     for chunk in range(64):
         assert records.text(chunk * RECORDS_IN_CHUNK) == f"row {chunk * RECORDS_IN_CHUNK}"
-    assert len(records._chunks) == 8
+    before = rows.reads
+    for chunk in range(56, 64):
+        records.text(chunk * RECORDS_IN_CHUNK)
+    assert rows.reads == before
+    records.text(0)
+    assert rows.reads == before + 1
 
 
 def test_the_published_schemas_are_those_of_the_classes():
