@@ -18,8 +18,11 @@ from support.shapes import GRID, chair, field_of, judged, latents_of, surface_la
 from slatprep.align import align, engine_versions, solver
 from slatprep.align.field import BEATEN, fitted_near
 from slatprep.align.ground import RAISED
-from slatprep.align.pair import FINE, TIE
+from slatprep.align.pair import FINE, TIE, Pair
+from slatprep.align.pose import Pose, Similarity
+from slatprep.align.search import repeated
 from slatprep.align.starts import distinct_starts
+from slatprep.align.surface import surface_of
 from slatprep.api import align_voxels
 from slatprep.errors import SlatprepError
 from slatprep.geometry.deformation import map_of
@@ -379,6 +382,18 @@ def test_what_repeats_itself_is_placed_right_or_is_not_good(whole, other, turn):
     annotation, judgement = look_up(field, latents, alignment, SampleParameters())
     right = annotation.material == there[tuple(latents.coords.T.astype(int))]
     assert right[annotation.valid].mean() > 0.9 or judgement.verdict is not Verdict.GOOD
+
+
+@pytest.mark.parametrize("flip", [np.eye(3), np.diag([1.0, -1.0, -1.0])])
+def test_from_a_wrong_tooth_the_right_one_is_found(flip):
+    solid = _gear(12) > 0
+    solid[28:36, 28:36, 31:41] = True
+    gear = surface_of(np.roll(solid, (3, -4, 12), axis=(0, 1, 2)))
+    turn = _turn(60, 0, 0, 1) @ flip
+    wrong = Pose(Similarity(turn, gear.centroid - turn @ gear.centroid, 1.0))
+    best, *_ = repeated(Pair(gear, gear, DEFAULT), wrong)
+    np.testing.assert_allclose(best.similarity.rotation, np.eye(3), atol=0.02)
+    np.testing.assert_allclose(best.similarity.shift, 0.0, atol=0.2)
 
 
 @pytest.mark.parametrize(("engine", "extra"), [("open3d", "paper"), ("small_gicp", "bench")])

@@ -13,6 +13,9 @@ from slatprep import records
 from slatprep.align import align
 from slatprep.align import field as engine
 from slatprep.align.ground import find_layers, gain, worth
+from slatprep.align.mirror import mirror_gain
+from slatprep.align.pair import Pair
+from slatprep.align.pose import Similarity
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
@@ -63,10 +66,11 @@ def test_an_object_on_ground_is_placed_as_without(thickness, degrees, radius, sc
 
 
 def test_the_top_of_a_slab_is_found():
-    ground = find_layers(surface_of(chair() | slab(3.0)))[0]
-    np.testing.assert_allclose(ground.normal, [0, 0, 1], atol=0.01)
-    # The slab's highest voxels have the index FOOT - 1; centres are half a voxel off.
-    assert ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=0.75)
+    for way in (1, -1):  # below and above
+        ground = find_layers(surface_of((chair() | slab(3.0))[:, :, ::way]))[0]
+        np.testing.assert_allclose(ground.normal, [0, 0, way], atol=0.01)
+        # The slab's highest voxels have the index FOOT - 1; centres are half a voxel off.
+        assert ground.height * 64 + 31.5 == pytest.approx(FOOT - 0.5, abs=0.75)
 
 
 def board() -> np.ndarray:
@@ -243,6 +247,15 @@ def test_a_mirrored_annotation_is_told_in_any_rotation_and_no_other(seed):
         there = other if seed is None else turned(other, seed)
         gains.append(mirrored_gain(bitten(chair(), (30, 24, 28)), there))
     assert gains[0] > 2 * LIMIT and not gains[1] > 0.0
+
+
+def test_a_mirrored_annotation_is_told_by_what_is_left_once_deformed():
+    solid = bitten(chair(), (30, 24, 28))
+    for other, told in ((chair()[::-1], True), (chair(), False)):
+        found = align(field_of(solid), surface_latents(other), DEFAULT)
+        pair = Pair(surface_of(other), surface_of(solid), DEFAULT)
+        gained = mirror_gain(pair, Similarity.of(found.transform), poor=True)
+        assert gained > 2 * LIMIT if told else gained < 0.0
 
 
 def boxes(seed: int) -> NDArray[np.bool_]:

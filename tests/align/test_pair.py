@@ -354,6 +354,7 @@ def test_of_contested_placements_the_one_that_fits_once_deformed_is_the_best(squ
     chosen = [min(poses, key=upright), *poses[:2]]
     (best, *others), deformed = finish(pair, chosen, rough=True)
     assert deformed.deformation is not None
+    assert deformed.pose is best.similarity
     assert upright(best) < 10.0
     fine = pair.refine(chosen, FINE._replace(size_by_slat=True))
     # It takes over the score that the best one had, and the others have less.

@@ -15,6 +15,7 @@ from slatprep.align.consensus import (
     TEMPERATURE,
     degrees_between,
     find_consensus,
+    is_common,
     probability_of_common,
     settle,
     turn_if_likelier,
@@ -43,7 +44,7 @@ def consensus_of(transforms: list[np.ndarray]) -> records.Consensus | None:
 
 def _tilted(rotation: np.ndarray, seed: int) -> np.ndarray:
     tilt = Rotation.from_rotvec(np.random.default_rng(seed).normal(scale=0.05, size=3))
-    return make_transform(tilt.as_matrix() @ rotation, [0.01, 0.0, 0.02])
+    return make_transform(tilt.as_matrix() @ rotation, [0.01, 0.0, 0.02], 0.7)
 
 
 def test_the_common_rotation_is_found_among_others():
@@ -68,8 +69,12 @@ def test_just_enough_is_enough():
     assert consensus_of(five + others[:6]) is None
     for degrees, agreeing in ((29.9, 6), (30.1, 5)):
         turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
-        found = consensus_of([*five, make_transform(turn @ COMMON)])
+        turn = make_transform(turn @ COMMON, scale=0.7)
+        found = consensus_of([*five, turn])
         assert found.agreeing == agreeing
+        assert is_common(turn, _agreeing(5)) == (agreeing == 6)
+    between = make_transform(Rotation.from_euler("x", 45, degrees=True).as_matrix())
+    assert consensus_of([between] * 5) is None
 
 
 def test_assets_of_one_object_count_once_for_each_way_they_are_turned():
@@ -82,7 +87,7 @@ def test_assets_of_one_object_count_once_for_each_way_they_are_turned():
     assert find_consensus(turns[:39], objects[:39]) is None
     # However many rows one object has, it has the same part in the mean.
     tilt = Rotation.from_euler("x", 12, degrees=True).as_matrix()
-    tilted = [make_transform(tilt @ COMMON)] * 36 + turns[36:40]
+    tilted = [make_transform(tilt @ tilt @ COMMON), turns[0]] * 18 + turns[36:40]
     mean = find_consensus(tilted, objects[:40]).rotation
     assert degrees_between(mean, COMMON) == pytest.approx(12 / 5, abs=0.05)
 
@@ -148,7 +153,7 @@ def test_odds_of_shapes_are_weighed_by_those_of_the_dataset(agree, others, score
     """By Bayes' rule: one more asset has any of the 23 other rotations, beside those counted."""
     consensus = _agreeing(agree, others)
     for number in (0, 22):
-        present = aligned(make_transform(AWAY[number]), score=score)
+        present = aligned(make_transform(AWAY[number], scale=0.7), score=score)
         prior = np.array([agree, (number < others) + 1 / 23])
         joint = prior * np.exp(np.array([gain, 0.0]) / TEMPERATURE * sharper)
         expected = joint[0] / joint.sum()
@@ -163,7 +168,7 @@ def test_ties_of_a_dataset_of_two_frames_are_no_surer_than_its_counts(agree, opp
     half = np.diag([-1.0, -1.0, 1.0]) @ COMMON
     turns = [COMMON] * agree + [half] * opposite
     consensus = consensus_of([make_transform(turn) for turn in turns])
-    tied = aligned(make_transform(COMMON), make_transform(half), score=1.0)
+    tied = aligned(make_transform(COMMON), make_transform(half, scale=0.7), score=1.0)
     by = settle(tied, latents_of([[1, 2, 3]]), consensus).settled_by
     assert (0 if by is None else by.probability) == pytest.approx(taken, abs=0.01)
 
@@ -173,6 +178,10 @@ def test_a_tie_that_fits_clearly_better_otherwise_stays_open():
     tied = aligned(make_transform(half), make_transform(COMMON), score=0.99)
     tied = replace(tied, placements=(replace(tied.placements[0], score=0.97),))
     assert settle(tied, latents_of([[1, 2, 3]]), _agreeing(40)) is tied
+    # So does one that the common rotation is not among, even if others have one of it too.
+    often = make_transform(Rotation.from_euler("z", 90, degrees=True).as_matrix() @ COMMON)
+    tied, turns = aligned(often, make_transform(half)), [make_transform(COMMON)] * 6 + [often] * 4
+    assert settle(tied, latents_of([[1, 2, 3]]), consensus_of(turns)) is tied
 
 
 @pytest.mark.parametrize(
@@ -191,12 +200,20 @@ def test_an_asset_that_fits_as_well_is_turned_as_the_dataset_is(boxed):
     field, latents, found = boxed
     choices = [found.transform, *(p.transform for p in found.placements)]
     wrong = next(c for c in choices if degrees_between(split_transform(c)[0], COMMON) > 60)
-    alone = replace(found, transform=wrong, placements=())
-    after = turn_if_likelier(alone, field, latents, _agreeing(19, 1), AlignParameters())
+    tie = records.Placement(ELSEWHERE, 0.5, 9.0)
+    alone, given = replace(found, transform=wrong, placements=(tie,)), (field, latents)
+    after = turn_if_likelier(alone, *given, _agreeing(19, 1), AlignParameters())
     assert displacement(after.transform, make_transform(COMMON), latents.centres) < 0.1
     assert isinstance(after.settled_by, records.Consensus)
     assert after.settled_by.probability > SURE
-    assert after.placements[0].transform.tobytes() == wrong.tobytes()
+    left = [placement.transform.tobytes() for placement in after.placements]
+    assert left == [wrong.tobytes(), ELSEWHERE.tobytes()]
+    # Nor is it turned if the fit leaves the common rotation for the right one.
+    beside = Rotation.from_euler("x", 35, degrees=True).as_matrix() @ COMMON
+    consensus = records.Consensus(beside, 500, 500)
+    assert turn_if_likelier(alone, *given, consensus, AlignParameters()) is alone
+    other = replace(alone, engine=records.Engine.OPEN3D)
+    assert turn_if_likelier(other, *given, _agreeing(19, 1), AlignParameters()) is other
 
 
 BY = records.LatentChoice(0.99, 12.0, 300, 40, 40)
@@ -213,22 +230,25 @@ ELSEWHERE = make_transform(Rotation.from_euler("x", 180, degrees=True).as_matrix
 def test_what_is_taken_is_fitted_as_aligning_would_fit_it(name, asked, model):
     move = MOVES.get(name, np.copy)
     field, latents = field_of(occupancy(np.copy)), surface_latents(occupancy(move))
-    parameters = AlignParameters(model=asked)
+    parameters = AlignParameters(model=asked, radius=1.5)
     found = align(field, latents, parameters)
     assert found.model is model
     # As if another placement had been taken for the best.
     right = records.Placement(found.transform, found.score, 20.0)
-    stiff = {"deformation": None, "figures": None, "model": records.Model.RIGID}
-    other = replace(found, transform=ELSEWHERE, placements=(right,), **stiff)
+    other = replace(found, transform=ELSEWHERE, placements=(right,))
     taken = take(other, 0, latents, BY)
-    assert taken.deformation is None
+    undeformed = model in (records.Model.RIGID, records.Model.SIMILARITY)
+    assert taken.deformation is taken.figures is None
+    assert taken.model is (model if undeformed else records.Model.SIMILARITY)
     np.testing.assert_array_equal(taken.placements[0].transform, ELSEWHERE)
     assert taken.placements[0].displacement > 5
     settled = refit(taken, field, latents, parameters)
     assert (settled.model, settled.settled_by) == (model, BY)
-    undeformed = model in (records.Model.RIGID, records.Model.SIMILARITY)
     assert (settled.deformation is None) == undeformed
-    assert settled.quality == measure_quality(field, latents, settled.transform, parameters.radius)
+    apart = displacement(ELSEWHERE, settled.transform, latents.centres)
+    assert settled.placements[0].displacement == pytest.approx(apart, rel=1e-9)
+    for one in (found, settled):
+        assert one.quality == measure_quality(field, latents, one.transform, 1.5)
     if asked == "auto":
         places = map_of(settled).places(latents.coords)
         off = np.linalg.norm(places - move(voxel_centres(latents.coords)), axis=1) / VOXEL_SIZE

@@ -5,10 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.shapes import GRID, aligned, annotated, field_of, latents_of, surface_latents
 
 from slatprep import records
+from slatprep.align.agreement import agreement_of
 from slatprep.align.figures import measure_figures
+from slatprep.align.pose import Similarity
+from slatprep.align.residuals import Residuals
+from slatprep.align.surface import surface_of
+from slatprep.align.warp import Warp
 from slatprep.geometry.frames import make_transform
 from slatprep.geometry.voxels import occupancy_of
 from slatprep.judge.confidence import class_confidence, voxel_figures
@@ -92,6 +98,42 @@ def test_what_was_not_measured_of_the_agreement_is_not_known():
     older = replace(fitted(), figures=replace(FIT, agreement=None))
     unknown = [name for name, value in figures(older, 0.0).items() if math.isnan(value)]
     assert unknown == list(FIGURES[-12:])
+
+
+def test_agreement_by_direction_and_by_block_by_hand():
+    """Eleven samples of a direction are too few to count, and other directions weigh as they do."""
+    rows = np.array([21, 21, 42, 11])
+    slat = np.concatenate([np.arange(20, -1, -1) / 10 * np.resize([1, -1], 21), np.zeros(21)])
+    pixieverse = np.repeat([-9.0, 1.5], rows[2:])
+    sine, cosine = np.sin(np.radians(20)), np.cos(np.radians(20))
+    normals = [[cosine, sine, 0], [-cosine, 0, -sine], [-(0.5**0.5), 0.5**0.5, 0], [0, 0, 1]]
+    normals = np.repeat(normals, rows, axis=0)
+    normals[:21:2, 1] *= -1.0
+    places = np.repeat([[-8.0, 0, 0], [0, 0, 0], [-8, 16, 0], [0, 8, 0]], rows, axis=0)
+    places += np.random.default_rng(0).uniform(0.0, 8.0, places.shape)
+    found = agreement_of(slat, pixieverse, normals, places)
+    # Of 0, 0.1 .. 2 the third is at 0.6; no direction counts with more than 4.
+    near, middle = ([one, 0.0, 4.0] @ rows[:3] / 84 for one in (0.6, 1.0))
+    directions = found.directions_near, found.directions_middle, found.directions_worst
+    assert directions == pytest.approx((near, middle, 0.6))
+    blocks = found.blocks_near, found.blocks_middle, found.blocks_far
+    assert blocks == pytest.approx((21 / 95, 42 / 95, 53 / 95))
+    assert found.within_slat == pytest.approx((27 / 42, 32 / 42, 37 / 42))
+    assert found.within_pixieverse == pytest.approx((0.0, 0.0, 11 / 53))
+    far = agreement_of(10 * slat, pixieverse, normals, places)
+    assert far.directions_worst == 4.0
+
+
+def test_normals_point_out_of_a_ball_however_it_is_turned():
+    slat, pixie = surface_of(ball(15.0)), surface_of(ball(15.0, 38.5))
+    turn = make_transform(Rotation.from_euler("xyz", [30, 70, -50], degrees=True).as_matrix())
+    pose = Similarity(turn[:3, :3], -turn[:3, :3] @ [7.0, 0.0, 0.0], 1.0)
+    residuals = Residuals(slat, pixie, pose, 300)
+    residuals.at(Warp.unbent(pose))
+    out = residuals.places / np.linalg.norm(residuals.places, axis=1, keepdims=True)
+    assert (residuals.normals() * out).sum(axis=1).min() > 0.8
+    other = Residuals(slat, pixie, pose, 300, first=300).places
+    assert not {*map(tuple, other[:300])} & {*map(tuple, residuals.places[:300])}
 
 
 def test_margin_and_ties_count_unless_ties_change_no_class_or_something_chose():
