@@ -43,20 +43,21 @@ def contents_of(parameters: BuildParameters) -> Contents:
         If a source has no usable description, describes one of `PROPERTIES` in another unit, or a
         further source has other properties or classes.
     """
-    held = source_adapter(parameters.pixieverse.adapter).describe(parameters.pixieverse)
-    for number, source in enumerate(parameters.also, 1):
-        other = source_adapter(source.adapter).describe(source)
+    sources = (parameters.pixieverse, *parameters.also)
+    units = {one.name: one.unit for one in PROPERTIES}
+    held, *_ = holdings = [source_adapter(one.adapter).describe(one) for one in sources]
+    for number, (source, other) in enumerate(zip(sources, holdings, strict=True)):
+        table = f"[[also]] {number}" if number else "[pixieverse]"
+        for one in other.properties:
+            if one.unit != (known := units.get(one.name, one.unit)):
+                raise ConfigError(
+                    f"{source.root}: has {one.name} in {one.unit}; expected {known}. If the values "
+                    f"have another unit, say so by units in {table}"
+                )
         if fault := _disagreement(other, held):
             raise ConfigError(
-                f"[[also]] {number} ({source.root}): {fault}; expected what [pixieverse] has, or "
+                f"{table} ({source.root}): {fault}; expected what [pixieverse] has, or "
                 "a part of it: name the source that has most as [pixieverse]"
-            )
-    units = {one.name: one.unit for one in PROPERTIES}
-    for one in held.properties:
-        if one.unit != (known := units.get(one.name, one.unit)):
-            raise ConfigError(
-                f"{parameters.pixieverse.root}: has {one.name} in {one.unit}; expected {known}. If "
-                f"the values have another unit, say so by units in [pixieverse]"
             )
     try:
         labels_of(held.classes)

@@ -20,6 +20,7 @@ from slatprep.errors import InputError, SlatprepError
 from slatprep.geometry.frames import split_transform
 from slatprep.geometry.voxels import flat_index
 from slatprep.parameters import PixieverseSource
+from slatprep.readers.plausible import coarse_places
 from slatprep.readers.values import require_plausible
 from slatprep.records.json_types import Count
 from slatprep.records.tables import CLASS_NAME, MAX_PROPERTIES
@@ -164,7 +165,8 @@ class ForeignSource(_Foreign):
         if not field.converted:
             where, values = pair.grid or pair.roots.pixieverse, field.properties.copy()
             material = field.material if field.classified else None
-            told = require_plausible(where, values, material, table, contents.classes, pair.roots)
+            told = coarse_places(field.voxels, side)
+            told += require_plausible(where, values, material, table, contents.classes, pair.roots)
             warnings = (*field.warnings, *told)
             field = replace(field, properties=values, warnings=warnings, converted=True)
         for one, column in zip(table, field.properties.T, strict=True):

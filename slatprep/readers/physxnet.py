@@ -26,6 +26,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from slatprep import records
 from slatprep.errors import ConfigError, InputError, needing
 from slatprep.parameters import PixieverseSource
 from slatprep.readers.adapters import FoundField, Holding, SourceAdapter
@@ -69,8 +70,7 @@ class PhysXNet(SourceAdapter):
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
         path, _ = require_complete(pair)
-        root, units = pair.roots.pixieverse, pair.roots.units
-        (beside,) = pair.beside
+        root, (beside,) = pair.roots.pixieverse, pair.beside
         data, file = load_source(path, root, "grid")
         rows = npy_array(data, path, _ROWS)
         text, points = load_source(beside, root, "description")
@@ -81,9 +81,9 @@ class PhysXNet(SourceAdapter):
         return field_of_voxels(
             path,
             np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1),
-            # From g/cm^3; if the dataset definition states a unit, it is applied later.
-            (1.0 if units.density else 1000.0) * rows[:, _DENSITY : _DENSITY + 1],
+            rows[:, _DENSITY : _DENSITY + 1],
             table=_TABLE,
+            bare=_BARE,
             max_unphysical=max_unphysical,
             sources=(file, points),
             frame=np.eye(4),
@@ -91,12 +91,15 @@ class PhysXNet(SourceAdapter):
         )
 
 
-_KEYS: dict[str, tuple[str, float, dict[str, float]]] = {
-    "youngs_modulus": ("Young's Modulus (GPa)", 1e9, {"gpa": 1e9}),
-    "density": ("density", 1e3, {"g/cm^3": 1e3, "g/cm³": 1e3, "kg/m^3": 1.0, "kg/m³": 1.0}),
-    "poissons_ratio": ("Poisson's Ratio", 1.0, {}),
+_KEYS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "youngs_modulus": ("Young's Modulus (GPa)", ("GPa",)),
+    "density": ("density", ("g/cm^3", "kg/m^3")),
+    "poissons_ratio": ("Poisson's Ratio", ()),
 }
-"""Key of each property, and factors to SI units of a bare number and of units behind a number."""
+"""Key of each property, and the units that may stand behind a number."""
+
+_BARE = records.Units("GPa", "g/cm^3")
+"""Units of numbers without one."""
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)", re.S)
 
@@ -131,11 +134,17 @@ class Parts(SourceAdapter):
     def read(self, pair: AssetPair, max_unphysical: float) -> MaterialField:
         """Read a field; see `slatprep.readers.adapters.SourceAdapter`."""
         path, _ = require_complete(pair)
-        root, units = pair.roots.pixieverse, pair.roots.units
+        root = pair.roots.pixieverse
         data, file = load_source(path, root, "grid")
         rows = _parts_of(data, path)
-        stated = {name for name in _KEYS if units.of(name)}
-        values = [[_number(part, name, name in stated, path) for name in _KEYS] for part in rows]
+        columns, own = [], dict[str, Any]()
+        for one in PROPERTIES:
+            stated = pair.roots.table if pair.roots.units.of(one.name) else ""
+            column = [_number(part, one.name, stated, path) for part in rows]
+            if any(unit for _, unit in column):
+                own[one.name] = one.unit  # All are converted here, not after it.
+            usual = _BARE.of(one.name) if one.name in own else ""
+            columns.append([float(records.to_si(n, unit or usual)) for n, unit in column])
         read = {one.name[:-4]: (one, *load_source(one, root, "description")) for one in pair.beside}
         meshes = []
         for label in (str(part["label"]) for part in rows):
@@ -148,7 +157,8 @@ class Parts(SourceAdapter):
         field = field_of_voxels(
             path,
             voxels,
-            np.array(values)[owner],
+            np.array(columns).T[owner],
+            bare=replace(_BARE, **own),
             max_unphysical=max_unphysical,
             sources=(file, *(source for _, _, source in read.values())),
             roots=pair.roots,
@@ -171,20 +181,23 @@ def _parts_of(data: bytes, path: Place) -> list[dict[str, Any]]:
     return list(parts)
 
 
-def _number(part: dict[str, Any], name: str, stated: bool, path: Place) -> float:
-    """Return a part's property in SI units; unchanged if the dataset definition states a unit."""
-    key, bare, units = _KEYS[name]
+def _number(part: dict[str, Any], name: str, stated: str, path: Place) -> tuple[float, str]:
+    """Return the number of a part's property, and the unit behind it; empty if there is none.
+
+    `stated` is the table of the dataset definition that states a unit, if it does.
+    """
+    key, units = _KEYS[name]
     given = part.get(key)
     match = _NUMBER.fullmatch(str(given))
-    unit = match[2].strip().lower() if match else "?"
-    known = {"": bare, **units}
-    if match is None or unit not in known:
+    text = match[2].strip().lower().replace("³", "^3") if match else "?"
+    known = {"": "", **{unit.lower(): unit for unit in units}}
+    if match is None or text not in known:
         expected = " or ".join(["a number", *units])
         raise InputError(path, f"part {part['label']} has {key} {given!r}", expected)
-    if stated and unit:
-        expected = f"a bare number, or no unit of {name} in [pixieverse]"
+    if text and stated:
+        expected = f"a bare number, or no unit of {name} in {stated}"
         raise InputError(path, f"part {part['label']} has {key} {given!r}", expected)
-    return float(match[1]) * (1.0 if stated else known[unit])
+    return float(match[1]), known[text]
 
 
 def _names(name: str, label: str) -> tuple[str, str]:

@@ -31,6 +31,7 @@ from slatprep.records import (
     Normalization,
     Place,
     SourceFile,
+    SourceRoots,
     oddity,
 )
 
@@ -96,7 +97,7 @@ class PixieVerse(SourceAdapter):
             raise InputError(path, "no voxel is occupied: all are background", "an occupied voxel")
         annotated = _annotated(occupancy, material, path, warnings)
         if pair.mask is not None and raw:
-            warnings += _contradictions(pair.mask, occupancy, material, pair.roots.plausibility)
+            warnings += _contradictions(pair.mask, occupancy, material, pair.roots)
 
         cells = np.flatnonzero(annotated)
         voxels = voxels_at(cells)
@@ -191,27 +192,27 @@ def _read_mask(values: NDArray[Any], path: Place, warnings: list[str]) -> NDArra
 
 
 def _contradictions(
-    path: Place, mask: NDArray[np.bool_], material: NDArray[np.int8], plausibility: str
+    path: Place, mask: NDArray[np.bool_], material: NDArray[np.int8], roots: SourceRoots
 ) -> list[str]:
     """Compare a mask with the classes of its raw grid, and return a warning if they differ.
 
     Predictions are not compared, as they may have any class outside the mask. InputError if most of
-    each is not in the other, and `plausibility` is ``refuse``.
+    each is not in the other, and `roots.plausibility` is ``refuse``.
     """
     classified = material != BACKGROUND
     both, whole, masked = (
         int(np.count_nonzero(one)) for one in (mask & classified, classified, mask)
     )
     left_out, empty = 1 - both / whole, 1 - both / masked
-    if plausibility == "off" or max(left_out, empty) <= _DIFFERS:
+    if roots.plausibility == "off" or max(left_out, empty) <= _DIFFERS:
         return []
     fault = (
         f"leaves out {left_out:.0%} of the voxels with a class, and {empty:.0%} of it is background"
     )
-    if min(left_out, empty) > _CONTRADICTS and plausibility == "refuse":
-        expected = "the mask of this grid, in the same axes, or none: mask = [] in [pixieverse]"
-        raise InputError(path, fault, f'{expected}; or set plausibility = "warn" there. {FOR_ALL}')
-    way = "is it of this grid, and in the same axes? mask = [] in [pixieverse] reads none at all"
+    if min(left_out, empty) > _CONTRADICTS and roots.plausibility == "refuse":
+        expected = "the mask of this grid, in the same axes, or none: mask = []; or plausibility"
+        raise InputError(path, fault, f'{expected} = "warn". {FOR_ALL.format(roots.table)}')
+    way = f"is it of this grid, and in the same axes? mask = [] in {roots.table} reads none at all"
     return [oddity("masks", f"{path.name} {fault}: {way}")]
 
 

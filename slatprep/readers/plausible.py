@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.records import FACTORS, LOG10, PROPERTIES, Units, oddity, to_si
+from slatprep.records import LOG10, PROPERTIES, Units, oddity, to_si
 
 EXTENTS = (
     # The softest gels have some Pa; diamond has 1.05 to 1.22 TPa (CRC Handbook of Chemistry and
@@ -33,7 +33,7 @@ ENOUGH = 64
 """Number of voxels below which coordinates and moments allow no conclusion."""
 
 
-def coarse_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
+def coarse_places(voxels: NDArray[Any], side: int, way: str = "") -> list[str]:
     """Warn if voxels (N, 3) fill an eighth of a grid: its lowest one, or every second cell."""
     every_second = (np.ptp(voxels % 2, axis=0) == 0).all()
     if len(voxels) < ENOUGH or (voxels.max() >= side // 2 and not every_second):
@@ -42,7 +42,7 @@ def coarse_places(voxels: NDArray[Any], side: int, way: str) -> list[str]:
     if every_second:
         where = "along each axis all coordinates are even, or all are odd"
     text = f"{where}, as on a grid of {side // 2}^3, and {side}^3 is read"
-    return [oddity("places", f"{text}; {way}")]
+    return [oddity("places", f"{text}; {way or f'make the voxels of a grid of {side}^3'}")]
 
 
 # Bounds on E over density [Pa m^3/kg]. Carbon has the most: diamond 3.5e8, fibres 4.4e8, nanotubes
@@ -77,11 +77,13 @@ _USUAL = {
 }
 _USUAL_MODULUS, _USUAL_DENSITY = (3e2, 3e11), (15.0, 9_000.0)
 
-_UNSTATED, _SI = Units(), {one.name: one.unit for one in PROPERTIES}
+_SI = {one.name: one.unit for one in PROPERTIES}
+UNSTATED = Units()
+"""Units of a source for which none are stated."""
 
 
 class Part(NamedTuple):
-    """Medians of a class in SI units, NaN for a property it lacks, and its share of the voxels."""
+    """Medians of a class, NaN for a property it lacks, and its share of the voxels."""
 
     name: str
     share: float
@@ -95,6 +97,17 @@ class Part(NamedTuple):
         return self.modulus, self.density, self.ratio
 
 
+def units_now(stated: Units, bare: Units) -> dict[str, str]:
+    """Return the unit by which each of `PROPERTIES` is read: stated, or else the adapter's."""
+    return {one.name: stated.of(one.name) or bare.of(one.name) or one.unit for one in PROPERTIES}
+
+
+def in_si(units: Mapping[str, str], part: Part) -> Part:
+    """Convert a part from these units, by property, to SI units."""
+    given = zip(PROPERTIES, part.values, strict=True)
+    return Part(part.name, part.share, *(float(to_si(one, units[k.name])) for k, one in given))
+
+
 def beyond_all(part: Part) -> str:
     """Say which value of a part is outside the range of all materials; empty if none is."""
     for one, (least, most), value in zip(PROPERTIES, EXTENTS, part.values, strict=True):
@@ -105,8 +118,8 @@ def beyond_all(part: Part) -> str:
     return ""
 
 
-def fault_of(part: Part, units: Units = _UNSTATED) -> str:
-    """Say which values of a part no material has; empty if all are plausible."""
+def fault_of(part: Part, units: Units = UNSTATED) -> str:
+    """Say which values of a part in SI units no material has; empty if all are plausible."""
     modulus, density = part.modulus, part.density
     if fault := beyond_all(part):
         return fault
@@ -118,11 +131,11 @@ def fault_of(part: Part, units: Units = _UNSTATED) -> str:
             f"density {density:.3g} kg/m^3, and no {part.name} is lighter than "
             f"{LIGHTEST[part.name]:g}"
         )
-    if not all(asked):
-        return ""
     both = f"Young's modulus {modulus:.3g} Pa with density {density:.3g} kg/m^3"
     if modulus > min(_STIFFEST, _FOAM * density) * density:
         return f"{both}: no material is so stiff and so light"
+    if not all(asked):
+        return ""
     if modulus < _SOFTEST * density:
         return f"{both}: no material is so soft and so heavy"
     if density > _HEAVY and modulus < _RUBBER:
@@ -164,21 +177,26 @@ def is_physical(part: Part) -> bool:
 
 
 class Mistake(NamedTuple):
-    """A common mistake: a description, the setting that corrects it, a function that undoes it."""
+    """A common mistake: a description, what corrects it, and the part in SI units without it."""
 
     words: str
     setting: str
     undo: Callable[[Part], Part]
 
 
-def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
-    """Return the mistakes that explain implausible values, the likeliest first."""
+def mistakes_of(
+    parts: Sequence[Part], stated: Units = UNSTATED, bare: Units = UNSTATED
+) -> list[Mistake]:
+    """Return the mistakes that explain implausible values, the likeliest first.
+
+    Values are as in the files: in the units `stated`, and where none is, in the adapter's `bare`.
+    """
     if _look_normalised(parts):
         setting = "channels first where the values are a prediction, normalised to [-1, 1]"
         return [Mistake("normalised ones", setting, lambda part: part)]
     whole = sum(part.share for part in parts)
     found = []
-    for mistake in _known_mistakes(parts, units):
+    for mistake in _known_mistakes(parts, stated, bare):
         undone = [mistake.undo(part) for part in parts]
         good = sum(part.share for part in undone if not fault_of(part))
         if good >= 0.9 * whole:
@@ -189,40 +207,38 @@ def mistakes_of(parts: Sequence[Part], units: Units) -> list[Mistake]:
     return [mistake for usual, mistake in found if usual <= best + 0.25]
 
 
-def _known_mistakes(parts: Sequence[Part], units: Units) -> Iterator[Mistake]:
+def _known_mistakes(parts: Sequence[Part], stated: Units, bare: Units) -> Iterator[Mistake]:
     """Yield common mistakes: units of one or both columns, ids of classes, and swapped columns."""
     known = {"youngs_modulus": ("GPa", "MPa", "kPa", f"{LOG10}Pa"),
              "density": ("g/cm^3", f"{LOG10}kg/m^3")}  # fmt: skip
-    choices: list[list[str]] = []
+    now, choices = units_now(stated, bare), list[list[str]]()
     for k, (name, others) in enumerate(known.items()):
-        stated = units.of(name)
-        lacking = all(math.isnan(part.values[k]) for part in parts)
-        fixed = lacking or (stated and FACTORS.get(stated, 1.0) == 1)
-        choices.append([stated] if fixed else list(dict.fromkeys([stated, "", *others])))
+        fixed = all(math.isnan(part.values[k]) for part in parts) or bare.of(name) == _SI[name]
+        tried = () if fixed else (_SI[name], *others)
+        choices.append(list(dict.fromkeys([now[name], *tried])))
     # Among pairs of units, two logarithms are the likeliest.
     pairs = sorted(
         product(*choices),
         key=lambda pair: (
-            sum(unit != units.of(name) for name, unit in zip(known, pair, strict=True)),
+            sum(unit != now[name] for name, unit in zip(known, pair, strict=True)),
             not all(one.startswith(LOG10) for one in pair),
         ),
     )
     for pair in pairs[1:]:
-        yield _other_units(dict(zip(known, pair, strict=True)), units)
+        yield _other_units(now | dict(zip(known, pair, strict=True)), stated, bare)
     if {part.name for part in parts} & LIGHTEST.keys():
         yield Mistake(
             "classes of PhysGaussian's table, where 3 is foam, 4 is snow and 5 is plasticine",
             "class ids 0 jelly, 1 metal, 2 sand, 3 visplas, 4 fluid, 5 snow, 6 stationary",
-            lambda part: part._replace(name=""),
+            lambda part: in_si(now, part)._replace(name=""),
         )
     if any(math.isnan(value) for part in parts for value in part.values):
         return
-    names = "Young's modulus", "density", "Poisson's ratio"
+    names = [one.title for one in PROPERTIES]
     for order in list(permutations(range(3)))[1:]:
         moved = [f"{names[k]} where {names[at]} belongs" for at, k in enumerate(order) if at != k]
-        yield Mistake(
-            f"swapped columns, {' and '.join(moved)}", "look at the order", partial(_moved, order)
-        )
+        words, undo = f"swapped columns, {' and '.join(moved)}", partial(_moved, order, now)
+        yield Mistake(words, "look at the order", undo)
 
 
 def in_toml(units: Mapping[str, str]) -> str:
@@ -231,36 +247,25 @@ def in_toml(units: Mapping[str, str]) -> str:
     return given and f"units = {{ {given} }}"
 
 
-def _other_units(truly: Mapping[str, str], stated: Units) -> Mistake:
-    """Return the mistake that values are `truly` in these units, by property; empty for SI."""
-    wrong = {name: unit for name, unit in truly.items() if unit != stated.of(name)}
-    revoked = [stated.of(name) for name in wrong if stated.of(name)]
-    words = " and ".join(unit or _SI[name] for name, unit in wrong.items())
-    if revoked:
-        words += f", not the stated {' and '.join(revoked)}"
+def _other_units(truly: Mapping[str, str], stated: Units, bare: Units) -> Mistake:
+    """Return the mistake that values are `truly` in these units, by property."""
+    now, usual = units_now(stated, bare), units_now(UNSTATED, bare)
+    wrong = [name for name, unit in truly.items() if unit != now[name]]
+    words = " and ".join(truly[name] for name in wrong)
+    if doubted := [now[name] for name in wrong if stated.of(name) or bare.of(name)]:
+        words += f", not {' and '.join(doubted)}"
     # Whole, as the key is replaced in the file: a unit that is right must not get lost.
-    setting = f"leave {in_toml(vars(stated))} out if they are in SI units"
-    if whole := in_toml(truly):
-        setting = (
-            f"or say {whole} in [pixieverse] of the dataset definition (a TOML file given with "
-            "--config)"
-        )
-    return Mistake(words, setting, partial(_scaled, stated, truly))
+    kept = {name: stated.of(name) for name in truly}
+    kept |= {name: truly[name] if truly[name] != usual[name] else "" for name in wrong}
+    leave = f"or leave {in_toml(vars(stated))} out if they are in {words.partition(',')[0]}"
+    setting = f"or say {whole}" if (whole := in_toml(kept)) else leave
+    return Mistake(words, setting, partial(in_si, truly))
 
 
-def _scaled(stated: Units, truly: Mapping[str, str], part: Part) -> Part:
-    """Convert modulus and density from the true units to SI units, not from the stated ones."""
-    scaled = {}
-    for name, value in (("youngs_modulus", part.modulus), ("density", part.density)):
-        was, unit = stated.of(name), truly[name]
-        # A stated logarithm is never questioned: its values are in SI units by now.
-        scaled[name] = value if unit == was else float(to_si(value / FACTORS.get(was, 1.0), unit))
-    return part._replace(modulus=scaled["youngs_modulus"], density=scaled["density"])
-
-
-def _moved(order: Sequence[int], part: Part) -> Part:
-    """Undo a swap that put column `order[at]` at the place of column `at`."""
-    return Part(part.name, part.share, *(part.values[order.index(k)] for k in range(3)))
+def _moved(order: Sequence[int], now: Mapping[str, str], part: Part) -> Part:
+    """Undo a swap that put column `order[at]` at the place of column `at`, in units `now`."""
+    moved = Part(part.name, part.share, *(part.values[order.index(k)] for k in range(3)))
+    return in_si(now, moved)
 
 
 def _look_normalised(parts: Sequence[Part]) -> bool:

@@ -13,37 +13,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slatprep import records
 from slatprep.errors import InputError
 from slatprep.readers.plausible import (
     EXTENTS,
+    UNSTATED,
     Part,
     beyond_all,
     fault_of,
+    in_si,
     in_toml,
     is_physical,
     mistakes_of,
     oddity_of,
+    units_now,
 )
-from slatprep.records import (
-    BACKGROUND,
-    FACTORS,
-    MATERIAL_CLASSES,
-    PROPERTIES,
-    Place,
-    Property,
-    SourceRoots,
-    Units,
-    oddity,
-    to_si,
-)
+from slatprep.records import PROPERTIES, Place, Property, SourceRoots, Units, oddity, to_si
 
 _GUESS = re.compile(r"the values look like (.+?)(?: \(or |: )")
 
 _PREDICTED = 1.5
 """Largest median magnitude of a prediction's values; log10 of most densities is above it."""
 
-FOR_ALL = "Such keys hold for all objects: where this one alone is so, mend its file"
-"""End of a message that names a key of the dataset definition."""
+FOR_ALL = (
+    "Such keys stand in {} of the dataset definition (a TOML file given with --config) and hold "
+    "for all objects: where this one alone is so, mend its file"
+)
+"""End of a message that names a key of a table of the dataset definition."""
 
 _SAMPLE = 1024
 """Least size of a sample of many voxels: enough for medians, which take a tenth of a ms."""
@@ -65,48 +61,52 @@ def require_plausible(
     table: Sequence[Property],
     classes: Sequence[str],
     roots: SourceRoots,
+    bare: Units = UNSTATED,
 ) -> list[str]:
     """Convert values (K, P) to SI units in place; compare them, by class (K,), with materials.
 
-    `roots` state the units of the values. Returns warnings; raises `InputError` if most voxels are
-    implausible and `roots.plausibility` is ``refuse``. Checking for NaN and other invalid values
-    is left to the reader.
+    `roots` state the units of the values, `bare` those of what they do not state: SI by default.
+    An SI unit in `bare` is one that the file itself states, and no setting is advised for it.
+    Returns warnings; raises `InputError` if most voxels are implausible and `roots.plausibility` is
+    ``refuse``. Checking for NaN and other invalid values is left to the reader.
     """
+    now = units_now(roots.units, bare)
+    checked = roots.plausibility != "off" and len(values) > 0
+    read = _parts(values, material, table, classes) if checked else []
     for column, one in enumerate(table):
-        unit = roots.units.of(one.name)
-        if unit and FACTORS.get(one.unit) == 1.0:
+        if (unit := now.get(one.name, one.unit)) != one.unit:
             with np.errstate(over="ignore"):
                 values[:, column] = to_si(values[:, column], unit)
-    if roots.plausibility == "off" or len(values) == 0:
-        return []
-    parts = _parts(values, material, table, classes)
+    parts = [in_si(now, part) for part in read]
     faults = [(part, fault) for part in parts if (fault := fault_of(part, roots.units))]
     if not faults:
         odd = [(part, told) for part in parts if (told := oddity_of(part, roots.units))]
         unusual = [oddity("values", f"{_named(part)} has {told}") for part, told in odd]
-        return unusual + _strays(values, table)
+        return unusual + (_strays(values, table) if checked else [])
     share = sum(part.share for part, _ in faults)
     (part, fault), *_ = sorted(faults, key=lambda one: -one[0].share)
     stated = in_toml(vars(roots.units))
     name = f"with {stated} {_named(part)}" if stated else _named(part)
     if share < _SHARE:
         return [oddity("values", f"{name} ({share:.0%} of the voxels) has {fault}")]
-    likely = mistakes_of(parts, roots.units)
+    likely = mistakes_of(read, roots.units, bare)
     if not likely and not is_physical(part):
         return []  # The reader refuses it, and names the voxel.
     what = f"{name} has {fault}"
-    advice = "values that a material has, in SI units"
+    own = [now[one.name] if bare.of(one.name) != one.unit else "the file's own unit"
+           for one in table if one.unit != "1" and one.name in now]  # fmt: skip
+    in_units = " and ".join(own) if {*own} - {"Pa", "kg/m^3"} else "SI units"
+    advice = f"values that a material has, in {in_units}"
     if likely:
         others = [one.words for one in likely[1:4]]
         guess = likely[0].words + (f" (or {', or '.join(others)})" if others else "")
         what = f"the values look like {guess}: {what}"
         check = "check which guess is right; " if others else ""
-        advice = f"SI units, in the documented order; {check}{likely[0].setting}"
+        advice = f"{in_units}, in the documented order; {check}{likely[0].setting}"
     if roots.plausibility == "warn":
         return [oddity("values", f'{what}; taken as they are (plausibility = "warn")')]
-    raise InputError(
-        where, what, f'{advice}; or set plausibility = "warn" in [pixieverse]. {FOR_ALL}'
-    )
+    keys = FOR_ALL.format(roots.table)
+    raise InputError(where, what, f'{advice}; or set plausibility = "warn". {keys}')
 
 
 def guess_in(reason: str) -> str:
@@ -129,10 +129,10 @@ def require_prediction(
     medians = np.median(np.abs(sample), axis=0)
     if not (medians > _PREDICTED).any():
         return []
-    parts = _parts(values, material, PROPERTIES, MATERIAL_CLASSES)
+    parts = _parts(values, material, PROPERTIES, records.MATERIAL_CLASSES)
     guesses: list[str] = []
     if all(part.modulus > 0 and part.density > 0 for part in parts):
-        guesses = [one.words for one in mistakes_of(parts, Units())]
+        guesses = [one.words for one in mistakes_of(parts)]
         if not any(map(fault_of, parts)):
             guesses.insert(0, "a raw grid in SI units, channels first")
     worst = int(np.argmax(medians))
@@ -155,13 +155,13 @@ def require_possible(where: str | Place, values: NDArray[Any], material: NDArray
 
     Other implausible values are measured: they are errors of the method.
     """
-    parts = [part for part in _parts(values, material, PROPERTIES, MATERIAL_CLASSES)
-             if part.name != MATERIAL_CLASSES[BACKGROUND]]  # fmt: skip
+    parts = [part for part in _parts(values, material, PROPERTIES, records.MATERIAL_CLASSES)
+             if part.name != records.MATERIAL_CLASSES[records.BACKGROUND]]  # fmt: skip
     faults = [(part, fault) for part in parts if (fault := beyond_all(part))]
     if not faults or sum(part.share for part, _ in faults) < _SHARE:
         return
     part, fault = faults[0]
-    guess = next((f"the values look like {one.words}: " for one in mistakes_of(parts, Units())), "")
+    guess = next((f"the values look like {one.words}: " for one in mistakes_of(parts)), "")
     raise InputError(where, f"{guess}{_named(part)} has {fault}", "values in SI units")
 
 

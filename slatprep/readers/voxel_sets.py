@@ -12,7 +12,7 @@ from slatprep import records
 from slatprep.errors import InputError
 from slatprep.geometry.voxels import flat_index, voxels_of
 from slatprep.normalize import from_mapped, to_mapped
-from slatprep.readers.plausible import coarse_places
+from slatprep.readers.plausible import UNSTATED, coarse_places
 from slatprep.readers.values import require_plausible
 
 MAX_RESOLUTION = 512
@@ -33,12 +33,15 @@ def field_of_voxels(
     frame: NDArray[np.float64] | None = None,
     names: Sequence[str] = (),
     description: str = "",
+    bare: records.Units = UNSTATED,
 ) -> records.MaterialField:
     """Make a field of annotated voxels (K, 3): integers in 0..resolution - 1, or float points.
 
     Points lie in the unit cube [-0.5, 0.5]^3. `properties` (K, P) have a column for each entry of
     `table`, in SI units or in those that `roots`, the pair's, state; these also say how implausible
-    values are treated. `material` (K,) are class ids, all 0 by default; `classes` counts them, at
+    values are treated. `bare` are the units of what `roots` do not state, by default SI units; an
+    SI unit named here is one that the file states, and is not doubted. `material` (K,) are class
+    ids, all 0 by default, or -1 for an occupied voxel without a class; `classes` counts them, at
     most 254. Errors call the source `where`.
 
     Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
@@ -53,42 +56,45 @@ def field_of_voxels(
     count, notes = len(cells), list[str]()
     whole = np.asarray(voxels).dtype.kind != "f"
     if whole:
-        way = f"say the grid's own resolution in {description}"
-        anew = f"make the voxels of a grid of {resolution}^3"
-        notes += coarse_places(cells, resolution, way if description else anew)
+        way = description and f"say the grid's own resolution in {description}"
+        notes += coarse_places(cells, resolution, way)
     given = np.zeros(count, np.int64) if material is None else np.asarray(material)
     with np.errstate(invalid="ignore"):
         own = given.astype(np.int64)
     if given.shape != (count,):
         raise InputError(where, f"has material {given.shape}", f"({count},)")
-    if (unknown := (own < 0) | (own >= classes) | (own != given)).any():
+    if (unknown := (own < -1) | (own >= classes) | (own != given)).any():
         row = int(np.argmax(unknown))
-        expected = f"classes 0 to {classes - 1}, and no row for a voxel without one"
+        expected = f"classes 0 to {classes - 1}, or -1 for an occupied voxel without one"
         raise InputError(where, f"has class {given[row]:g} in row {row}", expected)
+    if len(classed := np.flatnonzero(own >= 0)) == 0:
+        raise InputError(where, f"has no class in any of {count} rows", "a voxel with a class")
+    if without := count - len(classed):
+        notes.append(f"{without} occupied voxels have no class (-1); not annotated")
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
         values = np.asarray(properties).astype(np.float32)
     if values.shape != (count, len(table)):
         raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
-    labelled = None if material is None else own
+    known, labelled = values[classed], None if material is None else own[classed]
     names = names or roots.contents.classes
-    notes += require_plausible(where, values, labelled, table, names, roots)
+    notes += require_plausible(where, known, labelled, table, names, roots, bare)
 
     def told(row: int, column: int) -> tuple[str, Any]:
-        value = np.asarray(properties)[row, column]
-        return f"{table[column].name} {value:g} in row {row}", value
+        value = np.asarray(properties)[classed[row], column]
+        return f"{table[column].name} {value:g} in row {classed[row]}", value
 
-    keep = physical_rows(where, physical(values, table), table, told, max_unphysical, notes)
+    fine = physical_rows(where, physical(known, table), table, told, max_unphysical, notes)
+    keep, values = classed[fine], known[fine]
 
     side, index = min(resolution, records.RESOLUTION), cells
     if resolution > records.RESOLUTION:
         cells = (2 * cells + 1) * records.RESOLUTION // (2 * resolution)
     flat = flat_index(cells, side)
-    cell, labels, means = _merged(flat[keep], own[keep], values[keep], table)
-    if len(cell) < np.count_nonzero(keep):
+    cell, labels, means = _merged(flat[keep], own[keep], values, table)
+    if len(cell) < len(keep):
         if whole and description:
-            own_cells = flat_index(index, resolution)
-            _require_alike(where, np.flatnonzero(keep), own_cells, own, values)
-        notes.append(f"{np.count_nonzero(keep)} voxels were merged into {len(cell)} of {side}^3")
+            _require_alike(where, keep, flat_index(index[keep], resolution), own[keep], values)
+        notes.append(f"{len(keep)} voxels were merged into {len(cell)} of {side}^3")
     there = np.full(side**3, -1, dtype=np.int64)
     there[flat] = len(cell)  # occupied, annotated or not
     there[cell] = np.arange(len(cell))
@@ -101,7 +107,7 @@ def field_of_voxels(
         voxels=voxels_of(annotated),
         material=labels[rows[annotated]].astype(np.uint8),
         properties=means[rows[annotated]],
-        unphysical=int(np.count_nonzero(~keep)),
+        unphysical=len(classed) - len(keep),
         sources=tuple(sources),
         warnings=tuple(notes),
         table=tuple(table),
@@ -169,14 +175,14 @@ def _require_alike(
     classes: NDArray[np.int64],
     values: NDArray[np.float32],
 ) -> None:
-    """Refuse rows of the same voxel that differ in class or values."""
-    order = rows[np.argsort(flat[rows], kind="stable")]
+    """Refuse rows of the same voxel that differ in class or values; errors name `rows`."""
+    order = np.argsort(flat, kind="stable")
     twice = np.flatnonzero(np.diff(flat[order]) == 0)
     first, second = order[twice], order[twice + 1]
     unlike = ~np.isclose(values[first], values[second], rtol=1e-3, atol=0.0)  # as float16 rounds
     other = (classes[first] != classes[second]) | unlike.any(axis=1)
     if other.any():
-        both = f"rows {first[other][0]} and {second[other][0]}"
+        both = f"rows {rows[first[other][0]]} and {rows[second[other][0]]}"
         fault = f"{both} are of one voxel, and differ in class or properties"
         raise InputError(where, fault, "each voxel once; or points, as floats in the unit cube")
 

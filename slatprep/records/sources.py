@@ -148,6 +148,11 @@ class SourceRoots:
     units: Units = field(default_factory=Units)
     plausibility: Plausibility = "refuse"
 
+    @property
+    def table(self) -> str:
+        """The table of the dataset definition that names the source."""
+        return f"[[also]] {self.number}" if self.number else "[pixieverse]"
+
     def numbered(self, files: Iterable[SourceFile]) -> tuple[SourceFile, ...]:
         """Return files with the number of the source that they lie in."""
         return tuple(replace(file, source=self.number) for file in files)

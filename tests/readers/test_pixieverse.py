@@ -134,7 +134,7 @@ def test_a_mask_that_contradicts_its_grid_is_told_or_refused(make_pair):
     other = make_pair(grid=grid, mask=np.roll(same, 7, axis=0))
     with pytest.raises(InputError, match=r"mask\.npy: leaves out 70% of .*mask = \[\]") as caught:
         read_field(other)
-    assert 'plausibility = "warn" there. Such keys hold for all objects' in str(caught.value)
+    assert 'plausibility = "warn". Such keys stand in [pixieverse] of' in str(caught.value)
     few = np.roll(same, 1, axis=0)
     assert "leaves out 10% of" in read_field(make_pair(grid=grid, mask=few)).warnings[-1]
     unlabelled = changed(grid, (np.s_[20:24, 20:30, 20:30, 3], -1))

@@ -171,7 +171,7 @@ def test_what_is_stated_is_not_asked_about(read):
     with pytest.raises(InputError, match=r"1e\+13, and all materials have 1 to 2e\+12 Pa") as error:
         read(aerogel, units=Units(youngs_modulus="GPa"))
     assert 'with units = { youngs_modulus = "GPa" } class jelly has Young' in str(error.value)
-    assert "Such keys hold for all objects: where this one alone is so" in str(error.value)
+    assert "Such keys stand in [pixieverse] of the dataset definition" in str(error.value)
 
 
 LEAVE_E, LEAVE_RHO = (f'leave units = {{ {one} }} out if' for one in (
@@ -179,24 +179,23 @@ LEAVE_E, LEAVE_RHO = (f'leave units = {{ {one} }} out if' for one in (
 
 
 @pytest.mark.parametrize(("part", "stated", "guess", "advice"), [
-    ((METAL, 2e11, 7850, 0.3), {"youngs_modulus": "GPa"}, "Pa, not the stated GPa: ", LEAVE_E),
-    ((METAL, 2e11, 7850, 0.3), {"density": "g/cm^3"},
-     "kg/m^3, not the stated g/cm^3: ", LEAVE_RHO),
+    ((METAL, 2e11, 7850, 0.3), {"youngs_modulus": "GPa"}, "Pa, not GPa: ", LEAVE_E),
+    ((METAL, 2e11, 7850, 0.3), {"density": "g/cm^3"}, "kg/m^3, not g/cm^3: ", LEAVE_RHO),
     ((METAL, 2e11, 7850, 0.3), {"youngs_modulus": "MPa", "density": "g/cm^3"},
-     "Pa and kg/m^3, not the stated MPa and g/cm^3: ",
+     "Pa and kg/m^3, not MPa and g/cm^3: ",
      'leave units = { youngs_modulus = "MPa", density = "g/cm^3" } out if'),
     # Oak with E in MPa: without the unit E would be a million times too small, and plausible.
     ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "MPa", "density": "g/cm^3"},
-     "kg/m^3, not the stated g/cm^3 (or ", 'or say units = { youngs_modulus = "MPa" } in'),
+     "kg/m^3, not g/cm^3 (or ", 'or say units = { youngs_modulus = "MPa" };'),
     ((STATIONARY, 1e4, 600, 0.3), {"youngs_modulus": "GPa"},
-     "Pa, not the stated GPa (or MPa, not the stated GPa, ", f"is right; {LEAVE_E} they are in SI"),
+     "Pa, not GPa (or MPa, not GPa, ", f"is right; or {LEAVE_E} they are in Pa"),
     ((METAL, 2e5, 7850, 0.3), {"youngs_modulus": "GPa"},
-     "MPa, not the stated GPa (or kPa", 'right; or say units = { youngs_modulus = "MPa" } in'),
+     "MPa, not GPa (or kPa", 'right; or say units = { youngs_modulus = "MPa" };'),
     # The whole key is told, as it takes the place of the one that is there.
     ((JELLY, 2, 0.93, 0.49), {"youngs_modulus": "MPa"}, "g/cm^3 (or ",
-     'or say units = { youngs_modulus = "MPa", density = "g/cm^3" } in'),
+     'or say units = { youngs_modulus = "MPa", density = "g/cm^3" };'),
     ((METAL, 11.3, 7.85, 0.3), {"youngs_modulus": "log10 Pa"}, "g/cm^3",
-     'or say units = { youngs_modulus = "log10 Pa", density = "g/cm^3" } in'),
+     'or say units = { youngs_modulus = "log10 Pa", density = "g/cm^3" };'),
 ])  # fmt: skip
 def test_of_stated_units_the_wrong_one_is_named(read, part, stated, guess, advice):
     with pytest.raises(InputError) as error:

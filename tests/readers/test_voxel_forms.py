@@ -181,8 +181,14 @@ def test_a_known_property_in_another_unit_is_refused(root):
     modulus = {"name": "youngs_modulus", "unit": "GPa", "scale": "log10"}
     sources.write_description(root, (*TABLE, modulus), CLASSES)
     source = PixieverseSource(root, adapter="voxels")
-    with pytest.raises(ConfigError, match="has youngs_modulus in GPa; expected Pa"):
-        contents_of(BuildParameters(source, SlatSource(root)))
+    mine = PixieverseSource(root, samples="merge")
+    for first, also, table in (
+        (source, (), r"\[pixieverse\]"),
+        (mine, (source,), r"\[\[also\]\] 1"),
+    ):
+        said = f"has youngs_modulus in GPa; expected Pa.* by units in {table}$"
+        with pytest.raises(ConfigError, match=said):
+            contents_of(BuildParameters(first, SlatSource(root), also=also))
 
 
 def test_rows_and_voxels_of_physxnet_belong_together(tmp_path):
@@ -218,11 +224,30 @@ def test_descriptions_that_no_store_can_follow_are_refused(root, classes, said):
 
 
 def test_a_class_that_the_table_does_not_have_is_refused(root):
-    for material in (3, -1, 0.5):
+    for material in (3, -2, 0.5):
         rows = rows_of(10)
         rows["material"] = np.full(10, material, np.float32)
         sources.write_voxels(root, "a", "npz", rows)
-        refused(root, rf"has class {material:g} in row 0; expected classes 0 to 2, and no row")
+        refused(
+            root, rf"has class {material:g} in row 0; expected classes 0 to 2, or -1 for an occ"
+        )
+
+
+def test_a_voxel_without_a_class_is_occupied_and_no_more(root):
+    rows = rows_of(100)
+    rows["material"] = np.where(np.arange(100) < 60, -1, 1)
+    rows["density"] = np.where(np.arange(100) < 60, np.nan, 1000.0)
+    sources.write_voxels(root, "a", "npz", rows)
+    field = field_at(root)
+    assert field.occupancy[tuple(rows["voxels"].T)].all() and field.occupancy.sum() == 100
+    assert len(field.voxels) == 40 and field.unphysical == 0 and (field.material == 1).all()
+    assert field.warnings == ("60 occupied voxels have no class (-1); not annotated",)
+    rows["density"][60:65] = 0
+    sources.write_voxels(root, "a", "npz", rows)
+    refused(root, "5 of 40 annotated voxels are unphysical, the first by density 0 in row 60")
+    rows["material"] = np.full(100, -1)
+    sources.write_voxels(root, "a", "npz", rows)
+    refused(root, "has no class in any of 100 rows; expected a voxel with a class")
 
 
 def edit(change: Callable[[str], str]) -> Callable[[Path], object]:
@@ -475,6 +500,58 @@ def test_units_may_be_stated_in_the_definition(tmp_path):
     # A unit behind a number is another statement.
     root = write_object(tmp_path / "both", [(HANDLE, cuboid(*CUBE))])
     refused(root, r"has density '7.8 g/cm.3'; expected a bare number", "parts", density="kg/m^3")
+
+
+ADVISED = re.compile(r"or (say|leave) units = \{ (.+?) \}")
+
+
+def followed(root: Path, adapter: str, units: dict[str, str], expected: list[float]) -> None:
+    """Hold that a field is as expected once the advice on units was followed to the letter.
+
+    Stated units may be wrong and plausible. Then nothing is advised of them.
+    """
+    taken = units
+    try:
+        field = field_at(root, adapter, **units)
+    except InputError as error:
+        verb, keys = ADVISED.search(str(error)).groups()
+        said = dict(re.findall(r'(\w+) = "(.+?)"', keys))
+        taken = said if verb == "say" else {}
+        field = field_at(root, adapter, **taken)
+    if not units.items() & taken.items():
+        np.testing.assert_allclose(field.properties[0], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("stated", [
+    {}, {"density": "kg/m^3"}, {"density": "g/cm^3"}, {"density": "log10 kg/m^3"},
+    {"youngs_modulus": "Pa"}, {"youngs_modulus": "MPa"}, {"youngs_modulus": "log10 Pa"},
+    {"youngs_modulus": "GPa", "density": "g/cm^3"}, {"youngs_modulus": "Pa", "density": "kg/m^3"},
+])  # fmt: skip
+@pytest.mark.parametrize(("modulus", "density"), [
+    (200, 7.8), (2e5, 7.8), (2e11, 7800), (200, 7800), (2e11, 7.8), (200, "7.8 g/cm^3"),
+    (2e11, "7800 kg/m³"), ("200 GPa", 7800),
+])  # fmt: skip
+def test_advice_on_units_holds_to_the_letter(tmp_path, modulus, density, stated):
+    stuff = {"density": density, "Young's Modulus (GPa)": modulus, "Poisson's Ratio": 0.29}
+    said = {name for name, one in (("density", density), ("youngs_modulus", modulus))
+            if isinstance(one, str)}  # fmt: skip
+    root = write_object(tmp_path, [(stuff, cuboid(*CUBE))])
+    units = {name: unit for name, unit in stated.items() if name not in said}
+    followed(root, "parts", units, [2e11, 7800, 0.29])
+    if isinstance(density, float | int) and "youngs_modulus" not in stated:
+        place, rows = tmp_path / "physx", rows_of(200)
+        sources.write_physxnet(place, "a", rows["voxels"], np.full(200, 1e3 * density))
+        followed(place, "physxnet", stated, [7800])
+
+
+def test_a_unit_that_the_file_states_is_its_own(tmp_path):
+    stuff = HANDLE | {"density": "7800 g/cm^3", "Young's Modulus (GPa)": 200}
+    root = write_object(tmp_path, [(stuff, cuboid(*CUBE))])
+    refused(
+        root,
+        "expected values that a material has, in GPa and the file's own unit; or set pl",
+        "parts",
+    )
 
 
 def test_parts_and_meshes_belong_together_one_by_one(tmp_path):
