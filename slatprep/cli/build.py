@@ -100,11 +100,11 @@ def make_demo(
         summary = make(directory, **chosen, jobs=jobs, progress=progress)
 
     def show() -> None:
-        title = f"Demo data in {summary.directory}"
+        title = f"Demo data in {summary.path}"
         output.table(title, ("category", "objects"), sorted(summary.categories.items()))
-        store = f"{summary.directory}.zarr"
+        store = f"{summary.path}.zarr"
         output.note(f"a store of it: slatprep build-store --config {summary.config} --out {store}")
-        output.note(f"its score:     slatprep score {store} {summary.directory / 'truth'}")
+        output.note(f"its score:     slatprep score {store} {summary.path / 'truth'}")
 
     output.made(summary, show)
 

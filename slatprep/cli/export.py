@@ -39,7 +39,8 @@ class FormatOptions:
     size : METRES
         usd: width of the unit cube. [default: 1]
     materials
-        usd: largest number of materials into which E and nu of an asset are binned. [default: 64]
+        usd: largest number of materials into which E and nu of an asset are binned, 7 or
+        more. [default: 64]
     """
 
     points: Annotated[Any | None, options.ChoiceOf("slatprep.export.formats:Points")] = None
@@ -275,4 +276,4 @@ def describe(
         return
     with output.new_file(out) as path:
         path.write_text(text, encoding="utf-8")
-    output.made({"out": out}, lambda: output.note(f"description: {out}"))
+    output.made({"path": out}, lambda: output.note(f"description: {out}"))

@@ -59,7 +59,8 @@ class Output:
 
     With `as_json`, standard output is one JSON document instead of tables. `verbosity` -1 prints
     only problems, and results that go to no file; 1 prints more details. If the command is
-    stopped, `if_stopped` is printed: what was replaced or kept, and how to go on.
+    stopped, `if_stopped` is printed: what was replaced or kept, and how to go on. `store` is the
+    one that the command was given, for JSON.
     """
 
     def __init__(self, as_json: bool = False, verbosity: int = 0, command: str = "") -> None:
@@ -67,6 +68,7 @@ class Output:
         self.verbosity = verbosity
         self.command = command
         self.if_stopped = NOTHING_REPLACED
+        self.store: object = None
 
     def result(self, document: object, show: Callable[[], None], complete: bool = True) -> None:
         """Print a result: the document as JSON, otherwise by `show`.
@@ -83,7 +85,9 @@ class Output:
             click.get_current_context().exit(EXIT_INCOMPLETE)
 
     def _say_document(self, ok: bool, fields: Any) -> None:
-        say(as_json({"command": self.command, "version": version("slatprep"), "ok": ok, **fields}))
+        about = {"command": self.command, "version": version("slatprep"), "ok": ok}
+        read = {"store": self.store} if self.store else {}
+        say(as_json({**about, **read, **fields}))
 
     @contextmanager
     def failing(self) -> Iterator[None]:

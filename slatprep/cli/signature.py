@@ -92,6 +92,7 @@ def _runner(function: _Function) -> Callable[..., object]:
             given = {name: local_path(value) for name, value in options.items()}
             require_apart(context.command, given)
             _group(_hints(function), given)
+            output.store = given.get("store")
             return function(output, **given)
 
     return run

@@ -37,7 +37,7 @@ __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
 class DemoSummary:
     """The folder of a demo, its number of assets and rows, and assets by category and level."""
 
-    directory: Path
+    path: Path
     config: Path
     assets: int
     rows: int
@@ -159,7 +159,7 @@ def make_demo(
     _write_definition(root, recipe, entries)
     write_json(root / "demo.json", {"recipe": asdict(recipe), "assets": entries})
     return DemoSummary(
-        directory=root,
+        path=root,
         config=root / "dataset.toml",
         assets=len(entries),
         rows=len(entries) * views,

@@ -240,7 +240,8 @@ def test_lost_notes_are_told_on_standard_output_and_never_within_json(mixed_buil
     # It notes how many objects are in each split.
     done = shell(f"export {store} --format npz --out {tmp_path}/n --split train --json", "2>&-")
     assert done.returncode == 3
-    assert json.loads(done.stdout)["command"] == "export"
+    told = json.loads(done.stdout)
+    assert (told["command"], told["store"]) == ("export", str(store))
 
 
 def test_a_reader_that_has_read_enough_is_no_fault(mixed_build, tmp_path):

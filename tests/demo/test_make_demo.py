@@ -42,7 +42,7 @@ def made_once(monkeypatch):
 
 
 def test_layout_is_that_of_the_real_data(demo):
-    root = demo.directory
+    root = demo.path
     metadata = json.loads((root / "obj_ids_metadata.json").read_text())
     listed = json.loads((root / "demo.json").read_text())["assets"]
     assert len(metadata) == demo.assets == demo.rows == len(listed) == 5
@@ -87,11 +87,11 @@ def test_definition_names_the_roots(demo):
 
 def test_same_bytes_again_with_any_number_of_jobs_and_of_assets(demo, tmp_path):
     make_demo(tmp_path / "again", 5, 7, jobs=2)
-    assert tree(tmp_path / "again") == tree(demo.directory)
+    assert tree(tmp_path / "again") == tree(demo.path)
     for _ in range(2):  # the second time over itself
         make_demo(tmp_path / "fewer", 2, 7)
         for folder in ("pixieverse", "slat", "truth"):
-            fewer, all_of = (tree(one / folder) for one in (tmp_path / "fewer", demo.directory))
+            fewer, all_of = (tree(one / folder) for one in (tmp_path / "fewer", demo.path))
             assert fewer.items() <= all_of.items()
 
 
@@ -315,9 +315,9 @@ def test_a_wrong_frame_of_any_source_is_caught(tmp_path, source):
     text = made.config.read_text()
     if "[align]" not in text:
         text += '\n[align]\nengine = "known"\n'
-    root = made.directory / re.findall(r'^root = "(\w+)"$', text, re.M)[0]
+    root = made.path / re.findall(r'^root = "(\w+)"$', text, re.M)[0]
     made.config.write_text(text.replace("[slat]", 'transform = "{id}.frame.npy"\n\n[slat]'))
-    truths = sorted((made.directory / "truth").iterdir())
+    truths = sorted((made.path / "truth").iterdir())
     for truth, error in zip(truths, (np.eye(4), TURN), strict=True):
         with np.load(truth) as file:
             np.save(root / f"{truth.stem}.frame.npy", error @ file["transform"])

@@ -123,7 +123,7 @@ def test_a_card_says_what_is_known_and_what_is_not(mixed_build):
 def test_a_description_in_a_file_is_told_as_json(store, tmp_path):
     out = tmp_path / "s.json"
     told = commands.document("describe", store, "--out", out)
-    assert (told["command"], told["out"], told["ok"]) == ("describe", str(out), True)
+    assert (told["command"], told["path"], told["ok"]) == ("describe", str(out), True)
     assert json.loads(out.read_text())["@type"] == "sc:Dataset"
 
 
