@@ -271,7 +271,7 @@ def _changes(
     both = [list(own) for own in zip(*rows, strict=True)] or [[], []]
     # Column by column: all columns of a large store take much memory.
     names = (*(name for name in ASSET_COLUMNS if name != "verdict"), "transform")
-    columns = np.stack([_unequal(a.column(name)[both[0]], b.column(name)[both[1]])
+    columns = np.stack([_differ(name, a, b, a.column(name)[both[0]], b.column(name)[both[1]])
                         for name in names])  # fmt: skip
     verdicts = [store.column("verdict")[own] for store, own in zip((a, b), both, strict=True)]
     sources = SourceStore(a), SourceStore(b)
@@ -285,6 +285,20 @@ def _changes(
         for k, pair in enumerate(rows)
     )
     yield from counted(run_in_order(_compare, tasks, jobs), len(rows), progress)
+
+
+def _differ(
+    name: str, a: Store, b: Store, one: NDArray[Any], other: NDArray[Any]
+) -> NDArray[np.bool_]:
+    """Return which rows of a column differ; differences of properties count as by one range."""
+    as_they_are = (
+        a.normalization.ranges == b.normalization.ranges or one.shape[1:] != other.shape[1:]
+    )
+    if as_they_are or name not in ("property_ambiguity", "spread"):
+        return _unequal(one, other)
+    widths = [np.ptp(store.normalization.spans, axis=1) for store in (a, b)]
+    same = np.isclose(one * widths[0], other * widths[1], _ROUNDING, _ROUNDING, equal_nan=True)
+    return np.asarray(~same.all(axis=1), bool)
 
 
 def _unequal(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
@@ -340,7 +354,7 @@ def _compare(
         moved = float(np.linalg.norm(apart, axis=1).mean() * RESOLUTION)
     labels = (one["material"] != other["material"]) | (one["valid"] != other["valid"])
     properties = _properties(a, b, one.pop("properties"), other.pop("properties"))
-    differ = [name for name in one if _unequal(one[name], other[name]).any()]
+    differ = [name for name in one if _differ(name, a, b, one[name], other[name]).any()]
     differ += ["properties"] * any(own.changed for own in properties.values())
     differ += ["coords"] * (not order)
     arrays = [*columns, *(f"voxel/{name}" for name in differ)]

@@ -17,6 +17,7 @@ from support.trees import copied, records_of, tree
 from slatprep.errors import ConfigError, StoreError
 from slatprep.export import export_store
 from slatprep.inspect.check import check_alignment
+from slatprep.inspect.compare import compare_stores
 from slatprep.inspect.verify import verify_store
 from slatprep.parameters import BuildParameters, ConsensusParameters, PixieverseSource, Samples
 from slatprep.parameters.files import load_parameters
@@ -416,11 +417,12 @@ def test_joined_and_chosen_stores_keep_their_spread(merged, tmp_path):
         rtol=1e-5,
     )
     assert not joined.asset("d").merged
+    assert compare_stores(tmp_path / "a.zarr", joined).changed == 0
     assert verify_store(tmp_path / "joined.zarr").findings == ()
 
 
 @pytest.mark.parametrize(("changes", "words"), [
-    ({"properties": [DENSITY | {"unit": "g/cm^3"}]}, "density in g/cm^3, log10"),
+    ({"properties": [DENSITY | {"unit": "g/cm^3"}]}, "density in g/cm^3; expected kg/m^3"),
     ({"properties": [DENSITY | {"scale": "linear"}]}, "density in kg/m^3, linear"),
     ({"properties": [DENSITY | {"name": "damping"}]}, "the property damping, which"),
     ({"classes": ["wood", "steel"]}, "the classes wood, steel"),
