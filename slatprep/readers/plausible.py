@@ -103,9 +103,9 @@ def units_now(stated: Units, bare: Units) -> dict[str, str]:
 
 
 def in_si(units: Mapping[str, str], part: Part) -> Part:
-    """Convert a part from these units, by property, to SI units."""
-    given = zip(PROPERTIES, part.values, strict=True)
-    return Part(part.name, part.share, *(float(to_si(one, units[k.name])) for k, one in given))
+    """Convert a part from these units, by property, to SI units, rounded as fields hold them."""
+    values = (to_si(one, units[k.name]) for k, one in zip(PROPERTIES, part.values, strict=True))
+    return Part(part.name, part.share, *(float(np.float32(one)) for one in values))
 
 
 def beyond_all(part: Part) -> str:
@@ -191,7 +191,7 @@ def mistakes_of(
 
     Values are as in the files: in the units `stated`, and where none is, in the adapter's `bare`.
     """
-    if _look_normalised(parts):
+    if _look_normalised([in_si(units_now(stated, bare), part) for part in parts]):
         setting = "channels first where the values are a prediction, normalised to [-1, 1]"
         return [Mistake("normalised ones", setting, lambda part: part)]
     whole = sum(part.share for part in parts)
@@ -232,7 +232,8 @@ def _known_mistakes(parts: Sequence[Part], stated: Units, bare: Units) -> Iterat
             "class ids 0 jelly, 1 metal, 2 sand, 3 visplas, 4 fluid, 5 snow, 6 stationary",
             lambda part: in_si(now, part)._replace(name=""),
         )
-    if any(math.isnan(value) for part in parts for value in part.values):
+    # What has units of its own has names as well, and no order.
+    if any(vars(bare).values()) or any(math.isnan(one) for part in parts for one in part.values):
         return
     names = [one.title for one in PROPERTIES]
     for order in list(permutations(range(3)))[1:]:

@@ -56,7 +56,7 @@ _FEW = 0.05
 
 def require_plausible(
     where: str | Place,
-    values: NDArray[np.float32],
+    values: NDArray[np.floating],
     material: NDArray[Any] | None,
     table: Sequence[Property],
     classes: Sequence[str],
@@ -95,7 +95,7 @@ def require_plausible(
     what = f"{name} has {fault}"
     own = [now[one.name] if bare.of(one.name) != one.unit else "the file's own unit"
            for one in table if one.unit != "1" and one.name in now]  # fmt: skip
-    in_units = " and ".join(own) if {*own} - {"Pa", "kg/m^3"} else "SI units"
+    in_units = " and ".join(dict.fromkeys(own)) if {*own} - {"Pa", "kg/m^3"} else "SI units"
     advice = f"values that a material has, in {in_units}"
     if likely:
         others = [one.words for one in likely[1:4]]
@@ -176,7 +176,7 @@ def _sampled(count: int) -> NDArray[np.intp]:
 
 
 def _parts(
-    values: NDArray[np.float32],
+    values: NDArray[np.floating],
     material: NDArray[Any] | None,
     table: Sequence[Property],
     classes: Sequence[str],
@@ -200,7 +200,7 @@ def _parts(
     return parts
 
 
-def _known(values: NDArray[np.float32], table: Sequence[Property]) -> NDArray[np.float64]:
+def _known(values: NDArray[np.floating], table: Sequence[Property]) -> NDArray[np.float64]:
     """Return the columns `PROPERTIES` (K, 3) of values (K, P), NaN where the table lacks one."""
     columns = {one.name: k for k, one in enumerate(table)}
     own = np.full((len(values), len(PROPERTIES)), np.nan)

@@ -71,13 +71,14 @@ def field_of_voxels(
         raise InputError(where, f"has no class in any of {count} rows", "a voxel with a class")
     if without := count - len(classed):
         notes.append(f"{without} occupied voxels have no class (-1); not annotated")
-    with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
-        values = np.asarray(properties).astype(np.float32)
-    if values.shape != (count, len(table)):
-        raise InputError(where, f"has properties {values.shape}", f"({count}, {len(table)})")
-    known, labelled = values[classed], None if material is None else own[classed]
+    if (shape := np.shape(properties)) != (count, len(table)):
+        raise InputError(where, f"has properties {shape}", f"({count}, {len(table)})")
+    exact = np.asarray(properties)[classed].astype(np.float64)
+    labelled = None if material is None else own[classed]
     names = names or roots.contents.classes
-    notes += require_plausible(where, known, labelled, table, names, roots, bare)
+    notes += require_plausible(where, exact, labelled, table, names, roots, bare)
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
+        known = exact.astype(np.float32)
 
     def told(row: int, column: int) -> tuple[str, Any]:
         value = np.asarray(properties)[classed[row], column]
