@@ -7,6 +7,7 @@ import errno
 import pkgutil
 import sys
 import warnings
+from pathlib import Path
 from typing import Any, NoReturn
 
 import click
@@ -81,6 +82,13 @@ def _say_warning(
     say(f"slatprep: warning: {text}", err=True)
 
 
+def _has_working_folder() -> bool:
+    try:
+        return bool(Path.cwd())
+    except FileNotFoundError:
+        return False
+
+
 class LazyGroup(click.Group):
     """A group that imports a command when it is used, and prints errors as one line."""
 
@@ -127,10 +135,10 @@ class LazyGroup(click.Group):
             )
         except OSError as error:
             # A disk or an object store failed at a place without a message of its own.
-            if error.filename is None and error.errno != errno.ENOENT:
-                raise
             place, advice = error.filename, "run again"
-            if place is None:  # `os.getcwd` alone names no file that it did not find.
+            if place is None:
+                if _has_working_folder():
+                    raise
                 place, advice = "working folder", "change to one that exists"
             elif error.errno == errno.ENAMETOOLONG:
                 advice = "give a shorter name"

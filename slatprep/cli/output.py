@@ -78,16 +78,16 @@ class Output:
         """
         self.if_stopped = DONE
         if self.as_json:
-            self._say_document(complete, vars(document) if is_dataclass(document) else document)
+            fields = vars(document) if is_dataclass(document) else document
+            read = {"store": self.store} if self.store else {}
+            self._say_document(complete, {**read, **fields})  # type: ignore[dict-item]
         else:
             show()
         if not complete:
             click.get_current_context().exit(EXIT_INCOMPLETE)
 
     def _say_document(self, ok: bool, fields: Any) -> None:
-        about = {"command": self.command, "version": version("slatprep"), "ok": ok}
-        read = {"store": self.store} if self.store else {}
-        say(as_json({**about, **read, **fields}))
+        say(as_json({"command": self.command, "version": version("slatprep"), "ok": ok, **fields}))
 
     @contextmanager
     def failing(self) -> Iterator[None]:
