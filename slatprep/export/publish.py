@@ -85,7 +85,8 @@ def publish_store(
             ).assets
         for name, content in pictures.items():
             (folder / name).write_bytes(content)
-        card = card_of(store, stated, where, list(pictures), verdicts)
+        chosen = () if data == "store" else verdicts
+        card = card_of(store, stated, where, list(pictures), chosen)
         (folder / CARD).write_text(card, encoding="utf-8")
         names = list(local_files(folder))
         lines = (f"{file_digest(folder / name)}  {name}\n" for name in names)

@@ -94,8 +94,7 @@ class TruthScore:
     valid_share : float
         Share of the SLAT voxels that are valid.
     similarity_displacement, similarity_accuracy : float
-        Displacement, and share of right classes, of the truth's transform: the similarity
-        nearest to the true places.
+        Displacement, and share of right classes, of the truth's transform.
     """
 
     asset_id: str
