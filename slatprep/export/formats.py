@@ -56,9 +56,9 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
     rows = sorted({store.match(name) for name in words_of(assets)}) or range(len(store))
     chosen = sorted(store.ids[row] for row in rows if wanted[row])
     if not chosen:
-        which = "none of the assets named" if words_of(assets) else "no asset"
+        among = " among those named" if words_of(assets) else ""
         raise ConfigError(
-            f"{store.path}: {which} has the verdict {' or '.join(verdicts)}; the "
+            f"{store.path}: no asset has the verdict {' or '.join(verdicts)}{among}; the "
             f"verdicts are {tally(store.column('verdict')[list(rows)])}"
         )
     return chosen
