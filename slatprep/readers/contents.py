@@ -19,6 +19,7 @@ from slatprep.readers.files import refusing
 from slatprep.readers.plausible import ENOUGH
 from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
 from slatprep.records.encoders import LATENTS
+from slatprep.records.sources import table_of
 from slatprep.records.tables import PROPERTIES
 from slatprep.storage.documents import adapter_of, read_document
 from slatprep.storage.place import place_of
@@ -47,7 +48,7 @@ def contents_of(parameters: BuildParameters) -> Contents:
     units = {one.name: one.unit for one in PROPERTIES}
     held, *_ = holdings = [source_adapter(one.adapter).describe(one) for one in sources]
     for number, (source, other) in enumerate(zip(sources, holdings, strict=True)):
-        table = f"[[also]] {number}" if number else "[pixieverse]"
+        table = table_of(number)
         for one in other.properties:
             if one.unit != (known := units.get(one.name, one.unit)):
                 raise ConfigError(

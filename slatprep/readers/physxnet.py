@@ -139,7 +139,7 @@ class Parts(SourceAdapter):
         rows = _parts_of(data, path)
         columns, own = [], dict[str, Any]()
         for one in PROPERTIES:
-            stated = pair.roots.table if pair.roots.units.of(one.name) else ""
+            stated = records.table_of(pair.roots.number) if pair.roots.units.of(one.name) else ""
             column = [_number(part, one.name, stated, path) for part in rows]
             if any(unit for _, unit in column):
                 own[one.name] = one.unit  # All are converted here, not after it.

@@ -33,6 +33,7 @@ from slatprep.records import (
     SourceFile,
     SourceRoots,
     oddity,
+    table_of,
 )
 
 _CUBE = (RESOLUTION,) * 3
@@ -209,10 +210,11 @@ def _contradictions(
     fault = (
         f"leaves out {left_out:.0%} of the voxels with a class, and {empty:.0%} of it is background"
     )
+    table = table_of(roots.number)
     if min(left_out, empty) > _CONTRADICTS and roots.plausibility == "refuse":
         expected = "the mask of this grid, in the same axes, or none: mask = []; or plausibility"
-        raise InputError(path, fault, f'{expected} = "warn". {FOR_ALL.format(roots.table)}')
-    way = f"is it of this grid, and in the same axes? mask = [] in {roots.table} reads none at all"
+        raise InputError(path, fault, f'{expected} = "warn". {FOR_ALL.format(table)}')
+    way = f"is it of this grid, and in the same axes? mask = [] in {table} reads none at all"
     return [oddity("masks", f"{path.name} {fault}: {way}")]
 
 

@@ -105,7 +105,7 @@ def require_plausible(
         advice = f"{in_units}, in the documented order; {check}{likely[0].setting}"
     if roots.plausibility == "warn":
         return [oddity("values", f'{what}; taken as they are (plausibility = "warn")')]
-    keys = FOR_ALL.format(roots.table)
+    keys = FOR_ALL.format(records.table_of(roots.number))
     raise InputError(where, what, f'{advice}; or set plausibility = "warn". {keys}')
 
 

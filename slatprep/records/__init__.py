@@ -49,6 +49,7 @@ from slatprep.records.sources import (
     Units,
     oddities_in,
     oddity,
+    table_of,
     to_si,
 )
 from slatprep.records.tables import (

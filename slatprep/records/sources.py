@@ -130,6 +130,11 @@ class Units:
         return str(getattr(self, name, ""))
 
 
+def table_of(number: int) -> str:
+    """Return the table of the dataset definition that names the source of a number."""
+    return f"[[also]] {number}" if number else "[pixieverse]"
+
+
 @dataclass(frozen=True)
 class SourceRoots:
     """The root folders of a source and of the latents, and what they hold.
@@ -147,11 +152,6 @@ class SourceRoots:
     also: tuple[SourceRoots, ...] = ()
     units: Units = field(default_factory=Units)
     plausibility: Plausibility = "refuse"
-
-    @property
-    def table(self) -> str:
-        """The table of the dataset definition that names the source."""
-        return f"[[also]] {self.number}" if self.number else "[pixieverse]"
 
     def numbered(self, files: Iterable[SourceFile]) -> tuple[SourceFile, ...]:
         """Return files with the number of the source that they lie in."""

@@ -32,6 +32,7 @@ from slatprep.records import (
     Normalization,
     Place,
     SourceRoots,
+    table_of,
 )
 from slatprep.sample import in_table, merge
 from slatprep.storage.files import file_digest
@@ -199,7 +200,7 @@ def source_findings(
     """Yield findings on sources that are missing or differ from the record."""
     for source in record.sources:
         if source.source > len(roots.also):
-            what = f"{source.path} is of [[also]] {source.source}, whose root is not known"
+            what = f"{source.path} is of {table_of(source.source)}, whose root is not known"
             yield Finding("sources", record.asset_id, what, "its root, by --also")
             continue
         own = (roots, *roots.also)[source.source]
