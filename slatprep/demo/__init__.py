@@ -28,7 +28,7 @@ from slatprep.demo.sources import (
 )
 from slatprep.errors import ConfigError
 from slatprep.workers import Progress, counted
-from slatprep.workers.local import require_shared, run_unordered
+from slatprep.workers.local import require_workers, run_unordered
 
 __all__ = ["DemoAsset", "DemoSummary", "make_asset", "make_demo"]
 
@@ -149,7 +149,7 @@ def make_demo(
         source, encoder, slat_form, slat_names, results, samples,
     )  # fmt: skip
     _check(recipe)
-    require_shared(jobs, [])
+    require_workers(jobs)
     root = Path(directory)
     _claim(root, recipe)
     tasks = ((root, recipe, index) for index in range(assets))

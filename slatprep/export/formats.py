@@ -53,10 +53,11 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
     verdicts, wanted = words_of(verdicts), store.having(verdicts)
-    rows = sorted({store.match(name) for name in words_of(assets)}) or range(len(store))
+    named = sorted({store.match(name) for name in words_of(assets)})
+    rows = named or range(len(store))
     chosen = sorted(store.ids[row] for row in rows if wanted[row])
     if not chosen:
-        among = " among those named" if words_of(assets) else ""
+        among = " among those named" if named else ""
         raise ConfigError(
             f"{store.path}: no asset has the verdict {' or '.join(verdicts)}{among}; the "
             f"verdicts are {tally(store.column('verdict')[list(rows)])}"

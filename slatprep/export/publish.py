@@ -59,8 +59,9 @@ def publish_store(
     """Write a store of the local disk, or WebDataset shards of it, as a dataset for a hub.
 
     `pictures` for the card are PNG bytes by file name. Shards have the assets with one of
-    `verdicts`, and `progress` tells of them. ConfigError if the store is not local, or `out` lies
-    in one or holds other files. StoreError if a file differs from its digest.
+    `verdicts`, and `progress` tells of them; a store has all, so `verdicts` are none then.
+    ConfigError if the store is not local, or `out` lies in one or holds other files. StoreError if
+    a file differs from its digest.
     """
     local = storage_of(store.path).local
     if local is None:
@@ -85,8 +86,7 @@ def publish_store(
             ).assets
         for name, content in pictures.items():
             (folder / name).write_bytes(content)
-        chosen = () if data == "store" else verdicts
-        card = card_of(store, stated, where, list(pictures), chosen)
+        card = card_of(store, stated, where, list(pictures), verdicts)
         (folder / CARD).write_text(card, encoding="utf-8")
         names = list(local_files(folder))
         lines = (f"{file_digest(folder / name)}  {name}\n" for name in names)

@@ -291,10 +291,8 @@ def _differ(
     name: str, a: Store, b: Store, one: NDArray[Any], other: NDArray[Any]
 ) -> NDArray[np.bool_]:
     """Return which rows of a column differ; differences of properties count as by one range."""
-    as_they_are = (
-        a.normalization.ranges == b.normalization.ranges or one.shape[1:] != other.shape[1:]
-    )
-    if as_they_are or name not in ("property_ambiguity", "spread"):
+    scaled = name in ("property_ambiguity", "spread") and one.shape[1:] == other.shape[1:]
+    if not scaled or a.normalization.ranges == b.normalization.ranges:
         return _unequal(one, other)
     widths = [np.ptp(store.normalization.spans, axis=1) for store in (a, b)]
     same = np.isclose(one * widths[0], other * widths[1], _ROUNDING, _ROUNDING, equal_nan=True)

@@ -83,7 +83,7 @@ def run_unordered(
     SlatprepError. Workers must be able to import `function`; with 1 job it runs in this process.
     ConfigError, before any task begins, if there is no worker.
     """
-    _require_workers(jobs)
+    require_workers(jobs)
     if not isinstance(jobs, int):
         return jobs.run_unordered(function, tasks, died)
     if jobs == 1:
@@ -100,7 +100,8 @@ def _run_here(
         yield result
 
 
-def _require_workers(jobs: Jobs) -> None:
+def require_workers(jobs: Jobs) -> None:
+    """Raise `ConfigError` unless there is a worker."""
     if not hasattr(jobs, "run_unordered") and (not isinstance(jobs, int) or jobs < 1):
         raise ConfigError(f"jobs is {jobs!r}; expected a whole number from 1, or other workers")
 
@@ -144,14 +145,14 @@ def _numbered(
 
 def require_shared(jobs: Jobs, paths: Iterable[Place]) -> None:
     """Raise `SlatprepError` unless all workers see these files; local ones always do."""
-    _require_workers(jobs)
+    require_workers(jobs)
     if not isinstance(jobs, int):
         jobs.require_shared(paths)
 
 
 def at_most(most: int, jobs: Jobs) -> Jobs:
     """Limit a number of processes to `most`, but to at least one; leave other workers alone."""
-    _require_workers(jobs)
+    require_workers(jobs)
     return max(1, min(jobs, most)) if isinstance(jobs, int) else jobs
 
 
