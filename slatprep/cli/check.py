@@ -286,7 +286,7 @@ def measure_errors(
     from slatprep.pipeline.decoys import measure_errors as measure
 
     opened = options.opened(store)
-    with output.progress("decoys") as progress:
+    with output.progress("measure errors", "decoys") as progress:
         found = measure(opened, decoys, seed, jobs, progress)
     if picture is not None:
         from slatprep.inspect.pictures.statistics import draw_errors

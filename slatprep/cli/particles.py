@@ -246,11 +246,11 @@ def simulate(
         output.note(note)
     work.require_writable(Path(out), *([picture.absolute().parent] if picture else ()))
     begin = time.perf_counter()
-    with output.progress("simulate") as progress:
+    with output.progress("simulate", "frames") as progress:
         moved = work.run(scene, **vars(motion), progress=progress)
     computed = time.perf_counter() - begin
     output.if_stopped = f"{out} holds frames of the old run, the new one, or both; run it again"
-    with output.progress("write") as progress:
+    with output.progress("write", "frames") as progress:
         count = work.write_frames(
             Path(out), scene, moved, motion.rate, picture, stretch, progress=progress
         )
