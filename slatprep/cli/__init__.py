@@ -5,17 +5,9 @@ from __future__ import annotations
 import os
 import sys
 
-from slatprep.workers.local import THREAD_VARIABLES
-
 
 def main() -> None:
     """Run `slatprep`; the entry point of the console script."""
-    # Each process computes on one thread: only `--jobs` decides how many cores are used, and
-    # no result depends on a thread count. Libraries read these variables when they are loaded;
-    # workers inherit them.
-    for variable in THREAD_VARIABLES:
-        os.environ[variable] = "1"
-    os.environ["MPLBACKEND"] = "Agg"  # All pictures are files, and matplotlib fails at other names.
     from slatprep.cli.process import ignore_stops, prepare_stop, prepare_streams
 
     prepare_stop()
@@ -27,6 +19,14 @@ def main() -> None:
         )
         raise SystemExit(2)
     try:
+        from slatprep.workers.local import THREAD_VARIABLES
+
+        # Each process computes on one thread: only `--jobs` decides how many cores are used, and
+        # no result depends on a thread count. Libraries read these variables when they are loaded;
+        # workers inherit them.
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+        # All pictures are files, and matplotlib fails at other names.
+        os.environ["MPLBACKEND"] = "Agg"
         from slatprep.cli.commands import slatprep
 
         slatprep(prog_name="slatprep")

@@ -106,7 +106,6 @@ def export(
     """
     given = format_options.of(kind)
     from slatprep.export import ExportOptions, export_store
-    from slatprep.export.target import HALF
     from slatprep.records import USABLE
 
     left_out: list[str] = []
@@ -124,7 +123,6 @@ def export(
         verdicts = USABLE
     if split != "all":
         assets = tuple(opened.ids[row] for row in rows)
-    output.if_stopped = HALF.format(out)
     with output.progress("export") as progress:
         summary = export_store(
             opened,
@@ -191,7 +189,6 @@ def publish(
     """
     from slatprep.export.croissant import Stated
     from slatprep.export.publish import publish_store
-    from slatprep.export.target import HALF
     from slatprep.records import USABLE
 
     if verdicts is not None and data == "store":
@@ -202,7 +199,6 @@ def publish(
     chosen = USABLE if verdicts is None and data == "webdataset" else verdicts or ()
     rows = [row for row, kept in enumerate(opened.having(chosen)) if kept]
     drawn = {"assets.png": _picture(opened, rows, pictures)} if pictures and rows else {}
-    output.if_stopped = HALF.format(out)
     with output.progress("publish") as progress:
         summary = publish_store(
             opened,

@@ -78,7 +78,7 @@ def show_quality(
     figures = ("confidence", "expected_accuracy", "fitness", "valid_share")
     total = overview.total
     output.table(
-        "Alignments (medians)",
+        "Alignments (medians; valid_share of all voxels)",
         ("category", *total.verdicts, *figures),
         [
             (group.name, *group.verdicts.values(), *attrgetter(*figures)(group))

@@ -29,6 +29,10 @@ _asked: list[int] = []
 _WAITING = {"asyncio", "zarr"}
 """Packages within which no KeyboardInterrupt is raised."""
 
+_WAITING_CALLS = "__del__", "_LateFaults.write", "_LateFaults.truncate"
+"""Ends of the names of functions within which none is raised. Python drops exceptions of the first,
+and HDF5 crashes the process after one of the others."""
+
 _AGAIN, _MOST_AGAIN = 0.05, 200
 """Seconds until a stop that waits is tried again, and the number of times until it waits no more.
 """
@@ -109,6 +113,9 @@ def stop_if_asked() -> None:
 
 def ignore_stops() -> None:
     """Ignore signals from now on, as the command has ended, and Python ends by itself."""
+    # If a KeyboardInterrupt left an `exec` of a text, as of a dataclass, ``python -m`` would kill
+    # itself by SIGINT in spite of the exit code. CPython forgets that at the next `exec`.
+    exec("")
     if sys.platform == "win32":
         return
     signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -120,7 +127,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
     _asked.append(number)
     while frame and len(_asked) < _MOST_AGAIN:
         package = str(frame.f_globals.get("__name__")).partition(".")[0]
-        if package in _WAITING or frame.f_code.co_name == "__del__":
+        if package in _WAITING or frame.f_code.co_qualname.endswith(_WAITING_CALLS):
             signal.signal(signal.SIGALRM, _stop)
             signal.setitimer(signal.ITIMER_REAL, _AGAIN)
             return

@@ -20,8 +20,9 @@ FORMAT_VERSION = 1
 INDEX = "index.json"
 """Name of the file that lists the contents of an exported folder."""
 
-HALF = "{} holds files of the old export, the new one, or both; run it again"
-"""The state of a folder, with other files in it, whose export ended midway."""
+_WHOLE = "{} is the old export or the new one, whole; run it again"
+_HALF = "{} holds files of the old export, the new one, or both; run it again"
+"""State of a folder whose replacement ended midway: without other files in it, and with them."""
 
 
 @contextmanager
@@ -41,13 +42,18 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
         new = scratch / "export"
         new.mkdir()
         yield new
-        if out.exists() and (others := set(_names_below(out)) - own):
-            try:
+        others = set(_names_below(out)) - own if out.exists() else set()
+        try:
+            if others:
                 _replace_files(new, out, own, others)
-            except OSError as error:
-                raise StoreError(f"{error.strerror}: {HALF.format(out)}") from None
-        else:
-            replace_directory(new, out)
+            else:
+                replace_directory(new, out)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt((_HALF if others else _WHOLE).format(out)) from None
+        except OSError as error:
+            if not others:
+                raise
+            raise StoreError(f"{error.strerror}: {_HALF.format(out)}") from None
 
 
 @contextmanager

@@ -48,9 +48,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well two voxel sets fit under a transform.
+    """How well the outer boundaries of two filled voxel sets fit under a transform.
 
-    Forward is PixieVerse boundary to SLAT, backward the reverse. Fitness is the share of voxels
+    Forward is PixieVerse to SLAT, backward the reverse. Fitness is the share of voxels
     with a partner within ``radius``, rmse the root mean square distance of these voxels. Distances
     are in voxels of the SLAT frame.
     """

@@ -164,10 +164,11 @@ def local_files(path: Path) -> dict[str, int]:
     """Return every file below a folder and its size in bytes.
 
     Names have forward slashes and are sorted by folder. Links are not followed; their size is
-    `LINK`. The size of other irregular files is `OTHER`.
+    `LINK`. The size of other irregular files is `OTHER`. PermissionError if a folder cannot be
+    listed.
     """
     found = {}
-    for folder, folders, files in os.walk(path):
+    for folder, folders, files in os.walk(path, onerror=_raise_denied):
         folders.sort()
         below = Path(folder).relative_to(path).as_posix()
         prefix = "" if below == "." else f"{below}/"
@@ -178,6 +179,11 @@ def local_files(path: Path) -> dict[str, int]:
             size = state.st_size if stat.S_ISREG(state.st_mode) else OTHER
             found[prefix + name] = LINK if stat.S_ISLNK(state.st_mode) else size
     return found
+
+
+def _raise_denied(error: OSError) -> None:
+    if isinstance(error, PermissionError):
+        raise error
 
 
 def file_digest(place: Place) -> str:

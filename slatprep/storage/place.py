@@ -63,8 +63,9 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     """Return a path of the local disk, or a `RemotePlace` for the URL of an object store.
 
     A relative path starts from `folder`, if given. Links in it are then resolved, and ``~`` stands
-    for the user's folder. TypeError if it is neither a text nor a path, ConfigError for a URL
-    without a bucket, or one that object stores take differently.
+    for the user's folder. ``.`` and a path that ends in ``..`` become absolute. TypeError if it is
+    neither a text nor a path, ConfigError for a URL without a bucket, or one that object stores
+    take differently.
 
     >>> print(place_of("s3://bucket/demo.zarr") / "zarr.json")
     s3://bucket/demo.zarr/zarr.json
@@ -87,7 +88,10 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     if not url and "://" in str(text):
         raise ConfigError(f"{str(text)!r} is no URL; expected one such as s3://bucket/name")
     path = Path("/", url[2]) if url else Path(str(text))
-    return path if folder is None else (folder / path.expanduser()).resolve()
+    if folder is not None:
+        return (folder / path.expanduser()).resolve()
+    # "." and ".." do not tell the names of what lies beside them.
+    return path.resolve() if path.name in ("", "..") else path
 
 
 def is_place(value: object) -> TypeGuard[Path | RemotePlace | ArchivePlace]:
@@ -124,7 +128,7 @@ class Storage:
         try:
             return self._sizes()
         except OSError as error:
-            where = self.local or self.remote
+            where = self.remote or error.filename or self.local
             raise StoreError(f"{where}: cannot be listed ({error.strerror})") from None
 
     def _sizes(self) -> dict[str, int]:

@@ -10,7 +10,6 @@ compared with lists of allowed names before zarr-python sees them.
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,9 +18,8 @@ from slatprep.errors import StoreError
 from slatprep.parameters import MAX_GRID_SHARD, MAX_VOXEL_CHUNK, MAX_VOXEL_SHARD
 from slatprep.records import MAX_CHANNELS, MAX_PROPERTIES, RESOLUTION, Place
 from slatprep.storage.documents import read_document
-from slatprep.storage.remote import RemotePlace
 from slatprep.store.layout import ASSET_CHUNK, COORDINATES, FILE, FIXED_SIZES, LAYOUTS, ArrayLayout
-from slatprep.store.shard_reader import UnreachableError
+from slatprep.store.shard_reader import UnreachableError, is_out_of_reach
 
 MAX_METADATA_BYTES = 16 * 2**20
 """Largest size of a zarr.json; all metadata of a store take about 50 kB."""
@@ -66,8 +64,7 @@ def read_metadata(path: Place) -> dict[str, Any]:
     try:
         return read_document(path, MAX_METADATA_BYTES)
     except (OSError, ValueError) as error:
-        remote = isinstance(path, RemotePlace)
-        if remote and isinstance(error, OSError) and error.errno != errno.ENOENT:
+        if isinstance(error, OSError) and is_out_of_reach(path, error):
             raise UnreachableError(path.parent, path.name, str(error.strerror)) from None
         raise StoreError(f"{path}: cannot be read as metadata ({error})") from None
 

@@ -23,7 +23,6 @@ from slatprep.errors import StoreError
 from slatprep.records import Place
 from slatprep.storage.files import LINK, file_digest, local_files
 from slatprep.storage.place import storage_of
-from slatprep.storage.remote import RemotePlace
 from slatprep.store.attributes import read_attributes, width_findings
 from slatprep.store.contract import (
     GROUPS,
@@ -36,7 +35,7 @@ from slatprep.store.contract import (
 )
 from slatprep.store.layout import ARRAYS, FILE, FILES, MERGED
 from slatprep.store.reader import Store
-from slatprep.store.shard_reader import UnreachableError
+from slatprep.store.shard_reader import UnreachableError, is_out_of_reach
 from slatprep.store.shard_writer import Written
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -238,7 +237,7 @@ def _compare(path: Place, name: str, found: int, size: int, digest: str) -> tupl
     try:
         actual = file_digest(path / name)
     except OSError as error:
-        if isinstance(path, RemotePlace) and not isinstance(error, FileNotFoundError):
+        if is_out_of_reach(path, error):
             raise UnreachableError(path, name, str(error.strerror)) from None
         return name, f"cannot be read ({error.strerror})", ""
     return name, "" if actual == digest else "its bytes changed", actual

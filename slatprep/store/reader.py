@@ -24,7 +24,7 @@ from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError, nu
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_METADATA_BYTES, MAX_VOXELS
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with, last_names
-from slatprep.store.shard_reader import DamagedFileError
+from slatprep.store.shard_reader import DamagedFileError, UnreachableError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -368,9 +368,16 @@ def opened_elsewhere(opens: Callable[..., Store], *of: object) -> Store:
 
 
 def is_store(path: Place) -> bool:
-    """Return whether a place itself is a slatprep store of any format version."""
+    """Return whether a place itself is a slatprep store of any format version.
+
+    UnreachableError if its ``zarr.json`` is there, on the local disk, and may not be read.
+    """
     try:
         _opened_root(path)
+    except UnreachableError:
+        if isinstance(path, Path):
+            raise
+        return False
     except StoreError:
         return False
     return True
@@ -424,10 +431,7 @@ def _opened_root(path: Place) -> tuple[dict[str, Any], Folder]:
             "`slatprep build-store`"
         ) from None
     except PermissionError as error:
-        raise StoreError(
-            f"{file}: may not be read ({error.strerror}); expected a store that these "
-            "credentials may read"
-        ) from None
+        raise UnreachableError(path, file.name, str(error.strerror)) from None
     except (OSError, ValueError) as error:
         # A pipe or a folder of that name is no store.
         if isinstance(error, OSError) and error.errno not in (errno.EINVAL, errno.EISDIR):

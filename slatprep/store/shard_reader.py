@@ -32,7 +32,7 @@ from slatprep.storage.chunks import (
     whole_sizes,
 )
 from slatprep.storage.place import Folder, RangeFile
-from slatprep.storage.remote import RemoteFolder
+from slatprep.storage.remote import RemoteFolder, RemotePlace
 from slatprep.store.layout import MAX_RECORD_BYTES, RECORD_ARRAY
 
 OPEN_SHARDS = 512
@@ -66,7 +66,7 @@ class DamagedFileError(StoreError):
 
 
 class UnreachableError(StoreError):
-    """A file of a store that an object store does not give; the `file` itself may be whole."""
+    """A file of a store that could not be read; the `file` itself may be whole."""
 
     def __init__(self, folder: object, file: str, fault: str) -> None:
         super().__init__(
@@ -77,6 +77,13 @@ class UnreachableError(StoreError):
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return (type(self), (self.folder, self.file, self.fault))
+
+
+def is_out_of_reach(place: object, error: OSError) -> bool:
+    """Return whether a file at a place, or in a folder, may be whole though it cannot be read."""
+    if isinstance(error, FileNotFoundError):
+        return False
+    return isinstance(error, PermissionError) or isinstance(place, RemotePlace | RemoteFolder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +276,7 @@ class RowReader:
                 f"{self.folder.path}/{file}: cannot be opened ({fault}); "
                 "raise the limit (ulimit -n), or close other files"
             )
-        if isinstance(self.folder, RemoteFolder):
+        if is_out_of_reach(self.folder, error):
             return UnreachableError(self.folder.path, file, fault)
         return self._damaged(number, f"cannot be read ({fault})")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 import threading
 import time
@@ -199,7 +200,8 @@ class _Processes(Pool):
         """Hand a call to a process; new processes replace killed ones."""
         while True:
             try:
-                future: Future[Any] = self._executor().submit(call)
+                with _interrupts_held():
+                    future: Future[Any] = self._executor().submit(call)
                 return future
             except self.killed:
                 continue
@@ -221,6 +223,25 @@ class _Processes(Pool):
             initializer=_end_with,
             initargs=(os.getpid(),),
         )
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold a SIGINT back; processes that start meanwhile never get one, as their parent ends them.
+
+    Otherwise Ctrl-C makes a process that is starting print a traceback.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # Started with the first process, it would unblock SIGINT.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_with(parent: int) -> None:

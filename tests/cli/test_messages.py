@@ -273,12 +273,26 @@ def test_documents_begin_alike_and_say_which_store_as_it_was_typed(store, monkey
     assert told["info"]["files"] == told["verify"]["files"] == files
 
 
-def test_a_store_that_may_not_be_read_is_no_other_kind_of_folder(copy):
-    (copy / "zarr.json").chmod(0)
+@pytest.mark.parametrize("denied", ["zarr.json", "asset/fitness/c/0", "voxel"])
+def test_a_store_that_may_not_be_read_is_neither_damaged_nor_another_folder(denied, copy, mixed):
+    (copy / denied).chmod(0)
     script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
-    told = python("-c", script, "info", copy, code=1).stderr
-    assert "zarr.json: may not be read (Permission denied)" in told
-    assert "is not a slatprep store" not in told
+    into = ("build-store", *mixed.sides, "--out", copy)
+    for words in (("info", copy), ("verify", copy), *[into] * (denied == "zarr.json")):
+        told = python("-c", script, *words, code=1).stderr
+        assert "(Permission denied)" in told and str(copy / denied) in told
+        assert "is not a slatprep store" not in told and "Copy the store again" not in told
+
+
+def test_a_store_may_be_named_by_the_folder_one_is_in(copy, monkeypatch):
+    told = run("list", copy).stdout
+    for folder, name in ((copy, "."), (copy / "asset", "..")):
+        monkeypatch.chdir(folder)
+        assert run("list", name).stdout == told.replace(str(copy), name)
+        assert len(open_store(name).column("fitness")) == 5
+        assert "is a store" in refused("subset", name, "--asset", "cup", "--out", name)
+        assert document("report", name)["path"] == str(copy.with_suffix(".html"))
+    assert document("verify", "..")["findings"] == []
 
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(store, mixed, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Tasks on processes of this machine and on a cluster, and the batches that a pool is given."""
 
 import os
+import signal
 import threading
 import time
 import warnings
@@ -80,6 +81,15 @@ def test_workers_compute_and_not_this_thread(jobs):
     assert threading.get_ident() not in run_unordered(threading.get_ident, [()] * 5, jobs)
     variables = [(name,) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")]
     assert list(run_unordered(os.getenv, variables, jobs)) == ["1", "1"]
+
+
+def _holds_interrupts(number: int) -> bool:
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_a_process_never_gets_the_interrupt_that_its_parent_handles():
+    assert all(run_unordered(_holds_interrupts, [(number,) for number in range(4)], 2))
+    assert not _holds_interrupts(0)
 
 
 def test_a_killed_worker_is_an_error_in_words():

@@ -146,6 +146,8 @@ def verify_store(
         files, found = file_findings(Store(path, document), jobs)
         findings = {*metadata_findings(path), *found}
         return Verification(path, 0, files, 0, None, tuple(sorted(findings)))
+    except UnreachableError:
+        raise
     except StoreError as error:
         if not _is_file(path / "zarr.json"):
             raise

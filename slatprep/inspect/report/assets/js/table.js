@@ -29,7 +29,7 @@ const Table = (() => {
     model: "Rigid, similarity, affine or deformable: what maps the PixieVerse frame to the SLAT",
     confidence: "Calibrated probability that the placement is right",
     expected_accuracy: "Share of right classes to be expected among the valid voxels",
-    fitness: "Share of PixieVerse boundary voxels with a SLAT voxel within the radius, before any deformation",
+    fitness: "Share of PixieVerse's outer boundary voxels within the radius of one of the SLAT's, before any deformation",
     fitness_backward: "Share of SLAT voxels with a PixieVerse boundary voxel within the radius, before any deformation",
     inlier_rmse: "Root mean square distance of those, in voxels",
     valid_share: "Share of SLAT voxels that are valid: that found an annotation",
