@@ -166,7 +166,7 @@ class ForeignSource(_Foreign):
             where, values = pair.grid or pair.roots.pixieverse, field.properties.copy()
             material = field.material if field.classified else None
             told = coarse_places(field.voxels, side)
-            told += require_plausible(where, values, material, table, contents.classes, pair.roots)
+            told += require_plausible(where, values, material, table, pair.roots)
             warnings = (*field.warnings, *told)
             field = replace(field, properties=values, warnings=warnings, converted=True)
         for one, column in zip(table, field.properties.T, strict=True):

@@ -26,12 +26,10 @@ def field_of_voxels(
     roots: records.SourceRoots,
     resolution: int = records.RESOLUTION,
     material: NDArray[Any] | None = None,
-    classes: int = records.BACKGROUND,
     table: Sequence[records.Property] = records.PROPERTIES,
     max_unphysical: float = 0.0,
     sources: Sequence[records.SourceFile] = (),
     frame: NDArray[np.float64] | None = None,
-    names: Sequence[str] = (),
     description: str = "",
     bare: records.Units = UNSTATED,
 ) -> records.MaterialField:
@@ -40,17 +38,16 @@ def field_of_voxels(
     Points lie in the unit cube [-0.5, 0.5]^3. `properties` (K, P) have a column for each entry of
     `table`, in SI units or in those that `roots`, the pair's, state; these also say how implausible
     values are treated. `bare` are the units of what `roots` do not state, by default SI units; an
-    SI unit named here is one that the file states, and is not doubted. `material` (K,) are class
-    ids, all 0 by default, or -1 for an occupied voxel without a class; `classes` counts them, at
-    most 254. Errors call the source `where`.
+    SI unit named here is one that the file states, and is not doubted. `material` (K,) are ids of
+    the classes of `roots`, all 0 by default, or -1 for an occupied voxel without a class. Errors
+    call the source `where`.
 
     Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
     voxels' most frequent class (the lowest at a tie) and the mean properties of that class's
     voxels. The mean is in log10 for properties that are normalised in log10. InputError if there is
-    no voxel, one is out of range, or too many are unphysical. `names` are the classes' names, by
-    default those of `roots`. If a file `description` states the resolution, an integer voxel may
-    not occur twice with different values. Integer voxels that fill only an eighth of the grid give
-    a warning.
+    no voxel, one is out of range, or too many are unphysical. If a file `description` states the
+    resolution, an integer voxel may not occur twice with different values. Integer voxels that fill
+    only an eighth of the grid give a warning.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
@@ -63,9 +60,10 @@ def field_of_voxels(
         own = given.astype(np.int64)
     if given.shape != (count,):
         raise InputError(where, f"has material {given.shape}", f"({count},)")
-    if (unknown := (own < -1) | (own >= classes) | (own != given)).any():
+    last = len(roots.contents.labels) - 1
+    if (unknown := (own < -1) | (own > last) | (own != given)).any():
         row = int(np.argmax(unknown))
-        expected = f"classes 0 to {classes - 1}, or -1 for an occupied voxel without one"
+        expected = f"classes 0 to {last}, or -1 for an occupied voxel without one"
         raise InputError(where, f"has class {given[row]:g} in row {row}", expected)
     if len(classed := np.flatnonzero(own >= 0)) == 0:
         raise InputError(where, f"has no class in any of {count} rows", "a voxel with a class")
@@ -75,8 +73,7 @@ def field_of_voxels(
         raise InputError(where, f"has properties {shape}", f"({count}, {len(table)})")
     exact = np.asarray(properties)[classed].astype(np.float64)
     labelled = None if material is None else own[classed]
-    names = names or roots.contents.classes
-    notes += require_plausible(where, exact, labelled, table, names, roots, bare)
+    notes += require_plausible(where, exact, labelled, table, roots, bare)
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
         known = exact.astype(np.float32)
 
