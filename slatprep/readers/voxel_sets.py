@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep import records
 from slatprep.errors import InputError
-from slatprep.geometry.voxels import flat_index, voxels_of
+from slatprep.geometry.voxels import flat_index, occupancy_of, shown_in_cells, voxels_at
 from slatprep.normalize import from_mapped, to_mapped
 from slatprep.readers.plausible import UNSTATED, coarse_places
 from slatprep.readers.values import require_plausible
@@ -93,18 +93,12 @@ def field_of_voxels(
         if whole and description:
             _require_alike(where, keep, flat_index(index[keep], resolution), own[keep], values)
         notes.append(f"{len(keep)} voxels were merged into {len(cell)} of {side}^3")
-    there = np.full(side**3, -1, dtype=np.int64)
-    there[flat] = len(cell)  # occupied, annotated or not
-    there[cell] = np.arange(len(cell))
-    # A cell of the 64^3 grid takes the source's cell at its centre.
-    steps = (2 * np.arange(records.RESOLUTION) + 1) * side // (2 * records.RESOLUTION)
-    rows = there.reshape((side,) * 3)[np.ix_(steps, steps, steps)]
-    annotated = (rows >= 0) & (rows < len(cell))
+    annotated, rows = shown_in_cells(voxels_at(cell, (side,) * 3), side)
     return records.MaterialField(
-        occupancy=rows >= 0,
-        voxels=voxels_of(annotated),
-        material=labels[rows[annotated]].astype(np.uint8),
-        properties=means[rows[annotated]],
+        occupancy=occupancy_of(cells, side),
+        voxels=annotated,
+        material=labels[rows].astype(np.uint8),
+        properties=means[rows],
         unphysical=len(classed) - len(keep),
         sources=tuple(sources),
         warnings=tuple(notes),
