@@ -108,8 +108,8 @@ class ForeignSource(_Foreign):
                 f"{len(names)} properties; expected 1 to {MAX_PROPERTIES}, of a name each",
             )
             named = all(CLASS_NAME.fullmatch(one) for one in classes)
-            few = classes == records.MATERIAL_CLASSES or len(classes) <= records.MANY_BACKGROUND
-            self._require(named and few, f"classes {classes!r}")
+            self._require(named, f"classes {classes!r}")
+            records.labels_of(classes)
             return held
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[Any]:
