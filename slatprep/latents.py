@@ -44,11 +44,13 @@ class LatentsReader:
     ) -> None:
         self.space, self.standardised, self.note, self.problem = space, standardised, note, problem
         self.store = open_store(source) if is_store(source) else None
-        files = [] if self.store else discover_slats(SlatSource(root=source, encoder=space.encoder))
-        self.files = {file.asset_id: file for file in files}
-        there = self.store.ids if self.store else list(self.files)
         if self.store:
+            there = self.store.ids
             _require_encoder(source, self.store.contents.latents, space)
+        else:
+            slats = SlatSource(root=source, encoder=space.encoder)
+            self.folder, self.slats = discover_slats(slats)
+            there = list(self.slats)
         index = {asset_id: row for row, asset_id in enumerate(there)}
         chosen = {there[match_id(name, index, source)] for name in assets}
         self.ids = [asset_id for asset_id in there if not assets or asset_id in chosen]
@@ -108,18 +110,19 @@ class LatentsReader:
     def _moments_of_files(self) -> list[tuple[int, LatentMoments]]:
         """Number of voxels and moments of each of the first files that can be read."""
         known = []
-        for file in [one for one in self.files.values() if not one.problem][:_ASKED]:
+        for slat in [one for one in self.slats.values() if not one.problem][:_ASKED]:
             with suppress(InputError, StoreError):
-                latents = read_slat(file.path, file.root, file.group, self.space)
+                latents = read_slat(self.folder / slat.path, self.folder, slat.group, self.space)
                 known.append((len(latents.coords), latents.moments))
         return known
 
     def _latents(self, asset_id: str) -> StructuredLatents:
         if self.store is None:
-            file = self.files[asset_id]
-            if file.problem:
-                raise InputError(file.path, file.problem, "one SLAT an id")
-            return self._of_file(read_slat(file.path, file.root, file.group, self.space))
+            slat = self.slats[asset_id]
+            path = self.folder / slat.path
+            if slat.problem:
+                raise InputError(path, slat.problem, "one SLAT an id")
+            return self._of_file(read_slat(path, self.folder, slat.group, self.space))
         rows = self.store.read(asset_id, ("coords", "feats"))
         space, where = self.store.contents.latents, f"{self.store.path} [{asset_id}]"
         latents = checked_latents(rows["coords"], rows["feats"], where, space=space)

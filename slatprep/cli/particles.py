@@ -234,7 +234,6 @@ def simulate(
     work.old_frames(Path(out))  # Not only once all is computed.
     scene: Scene = work.prepare(
         source.field(output, "grid" if source.asset is not None else "slat"),
-        work.cells_of(source.store, source.asset),
         gaussians,
         axes,
         particles,

@@ -62,14 +62,13 @@ def verify(
         raise click.UsageError("--pixieverse and --slat go together: name both, or neither")
     from slatprep.inspect.verify import SourceRoots, verify_store
 
-    roots = None
+    roots = []
     if pixieverse and slat:
-        further = tuple(SourceRoots(one, slat, number=k) for k, one in enumerate(also, 1))
-        roots = SourceRoots(pixieverse, slat, also=further)
+        roots = [SourceRoots(one, slat, number=k) for k, one in enumerate((pixieverse, *also))]
     with workers.started(output) as jobs, output.progress("verify") as progress:
         result = verify_store(
             store,
-            sources=sources or roots is not None,
+            sources=sources or bool(roots),
             roots=roots,
             sample=sample,
             manifests=manifests,

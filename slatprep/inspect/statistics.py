@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import require_one_of, row_of_category
-from slatprep.inspect.tallies import JOINT_BINS, SIDES, Tally, no_tally, pooled, tally
+from slatprep.inspect.tallies import DRAWN_BINS, SIDES, Tally, no_tally, pooled, tally
 from slatprep.pipeline.rows import SourceStore
 from slatprep.records import Place, Verdict
 from slatprep.store import Store, open_store
@@ -21,9 +21,6 @@ from slatprep.workers.local import run_in_order
 
 BINS = 4096
 """Number of bins over a property's range from which quantiles are computed."""
-
-DRAWN_BINS = 64
-"""Number of bins of the histograms in the result."""
 
 _TASK_ASSETS = 32
 
@@ -232,6 +229,11 @@ def store_statistics(
     everything = _group(store, "all", "all", total, Counter(verdict_of[row] for row in rows))
     classes = [_group(store, "class", name, total, None, k) for k, name in enumerate(labels)]
     whole = everything.field.share, everything.slat.share
+    histograms = tuple(_histogram(store, total, index) for index in range(len(ranges)))
+    joint = None
+    if len(histograms) > 1:
+        one, other = histograms[:2]
+        joint = JointHistogram((one.name, other.name), (one.edges, other.edges), *total.joint)
     return StoreStatistics(
         store=store.path,
         assets=len(store),
@@ -241,8 +243,8 @@ def store_statistics(
         total=_of_whole(everything, *whole),
         classes=tuple(_of_whole(group, *whole) for group in classes),
         categories=tuple(_of_whole(group, *whole) for group in groups),
-        histograms=tuple(_histogram(store, total, index) for index in range(len(ranges))),
-        joint=_joint(store, total),
+        histograms=histograms,
+        joint=joint,
     )
 
 
@@ -331,15 +333,6 @@ def _histogram(store: Store, counts: Tally, number: int) -> Histogram:
     edges = np.linspace(span.lo, span.hi, DRAWN_BINS + 1)
     unit = store.contents.properties[number].unit
     return Histogram(span.name, unit, span.log10, edges, *sides)
-
-
-def _joint(store: Store, counts: Tally) -> JointHistogram | None:
-    """Return the joint histogram of the first two properties."""
-    if len(store.normalization.ranges) < 2:
-        return None
-    first, second = store.normalization.ranges[:2]
-    edges = [np.linspace(span.lo, span.hi, JOINT_BINS + 1) for span in (first, second)]
-    return JointHistogram((first.name, second.name), (edges[0], edges[1]), *counts.joint)
 
 
 def _distribution(mean: np.floating, std: np.floating, values: NDArray[np.float64]) -> Distribution:

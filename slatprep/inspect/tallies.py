@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from slatprep.normalize import denormalize_properties
 from slatprep.store import Store
 
-JOINT_BINS = 64
-"""Number of bins of each axis of the joint histogram, over [-1, 1]."""
+DRAWN_BINS = 64
+"""Number of bins of a histogram that is drawn, and of each axis of the joint one, over [-1, 1]."""
 
 Voxels = Iterable[NDArray[Any]]
 """Classes and normalised properties of voxels."""
@@ -45,7 +45,7 @@ class Tally:
         Weight by property, class and bin of the normalised value, over [-1, 1].
     sums : ndarray of float64, shape (2, P, C, bins)
         Weighted sum of the normalised values in each bin: the bin's mean is exact if all are equal.
-    joint : ndarray of float64, shape (2, JOINT_BINS, JOINT_BINS)
+    joint : ndarray of float64, shape (2, DRAWN_BINS, DRAWN_BINS)
         Weight by bins of the first two properties; zero if there is only one.
     mean, squares : ndarray of float64, shape (2, 2, P, C)
         Weighted mean, and weighted sum of squared differences from it, of the
@@ -133,10 +133,10 @@ def _side(
     places = own * bins + _bins(properties, bins)
     histogram = [np.bincount(row, minlength=size) for row in places]
     sums = [np.bincount(*pair, minlength=size) for pair in zip(places, values[0], strict=True)]
-    joint: NDArray[np.float64] = np.zeros(JOINT_BINS**2)
+    joint: NDArray[np.float64] = np.zeros(DRAWN_BINS**2)
     if len(properties) > 1:
-        first, second = _bins(properties[:2], JOINT_BINS)
-        joint += np.bincount(first * JOINT_BINS + second, minlength=JOINT_BINS**2) * weight
+        first, second = _bins(properties[:2], DRAWN_BINS)
+        joint += np.bincount(first * DRAWN_BINS + second, minlength=DRAWN_BINS**2) * weight
     mean, squares = np.zeros((2, 2, len(properties), labels))
     least, most = (np.full(mean.shape[1:], end) for end in (np.inf, -np.inf))
     for index in np.flatnonzero(counts[:-1]):
@@ -150,7 +150,7 @@ def _side(
         "weights": counts * weight,
         "histogram": np.stack(histogram).reshape(shape) * weight,
         "sums": np.stack(sums).reshape(shape) * weight,
-        "joint": joint.reshape(JOINT_BINS, JOINT_BINS),
+        "joint": joint.reshape(DRAWN_BINS, DRAWN_BINS),
         "mean": mean,
         "squares": squares,
         "least": least,

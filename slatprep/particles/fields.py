@@ -49,6 +49,8 @@ class VoxelField:
         The map from the SLAT frame to the voxels' frame; None if the frames are the same.
     resolution : int
         Voxels along each axis: 64, or more for a SLAT of a finer grid.
+    surface : ndarray of uint8, shape (M, 3), optional
+        The SLAT's cells of the 64^3 grid, if the voxels are those of a PixieVerse field.
     """
 
     voxels: NDArray[np.uint8]
@@ -56,6 +58,7 @@ class VoxelField:
     properties: NDArray[np.float32]
     place_map: PlaceMap | None = None
     resolution: int = RESOLUTION
+    surface: NDArray[np.uint8] | None = None
 
     @classmethod
     def of_slat(
@@ -108,8 +111,9 @@ def stored_field(store: Store, name: str | int, points: Points = "slat") -> Voxe
     require_solver_classes(store)
     if points == "grid":
         grid = asset.field
-        place_map = StoredRecords(store).place_map(asset)
-        field = VoxelField(grid.voxels, grid.material, grid.properties[:, columns], place_map)
+        place_map, (surface, _) = StoredRecords(store).place_map(asset), asset.cells
+        values = grid.properties[:, columns]
+        field = VoxelField(grid.voxels, grid.material, values, place_map, surface=surface)
     else:
         valid = asset.valid
         values = asset.properties_si[valid][:, columns]

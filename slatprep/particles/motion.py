@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError
 from slatprep.export.ply import has_comment
-from slatprep.geometry.voxels import filled, occupancy_of, shown_in_cells
+from slatprep.geometry.voxels import filled, occupancy_of
 from slatprep.particles import gaussians as splats
 from slatprep.particles.fields import VoxelField
 from slatprep.particles.read import FRAMES, Axes, Particles, read_particles
 from slatprep.particles.transfer import doubt_axes, recognise_axes, transfer
-from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION, Place
+from slatprep.records import BACKGROUND, MATERIAL_CLASSES, RESOLUTION
 from slatprep.storage.atomic import staged, writing
-from slatprep.store import open_store
 
 CLASSES = MATERIAL_CLASSES[:BACKGROUND]
 
@@ -43,17 +42,8 @@ class Scene(NamedTuple):
     notes: tuple[str, ...]
 
 
-def cells_of(store: Place | None, asset: str | None) -> NDArray[np.uint8] | None:
-    """Return the SLAT voxels (K, 3) of a stored asset, on the 64^3 grid; None without one."""
-    if store is None or asset is None:
-        return None
-    held = open_store(store).asset(asset)
-    return shown_in_cells(held.coords, held.latents.resolution)[0]
-
-
 def prepare(
     field: VoxelField,
-    cells: NDArray[np.uint8] | None,
     gaussians: Path | None,
     axes: Axes | None,
     count: int,
@@ -63,10 +53,14 @@ def prepare(
 ) -> Scene:
     """Fill the object with particles, `count` to a side of the unit cube, and get its Gaussians.
 
-    The SLAT's voxels `cells`, by default those of the field, are the surface of the object. Class,
-    Young's modulus [Pa] and density [kg/m^3] are for the whole object; None keeps the field's.
+    The SLAT's voxels are the surface of the object. Class, Young's modulus [Pa] and density
+    [kg/m^3] are for the whole object; None keeps the field's.
     """
-    solid = filled(occupancy_of(field.cells if cells is None else cells))
+    surface = field
+    if (cells := field.surface) is not None:
+        nothing = np.zeros(len(cells), np.uint8), np.ones((len(cells), 3), np.float32)
+        surface = VoxelField(cells, *nothing)
+    solid = filled(occupancy_of(surface.cells))
     positions = particles_of(solid, count)
     size, notes = (len(positions) / count**3) / solid.mean(), []
     if len(positions) and abs(size - 1.0) > 0.02:
@@ -85,10 +79,6 @@ def prepare(
     if gaussians is None:
         made = splats.gaussians_of(positions, classes, 1 / count)
         return Scene(*own, made, positions, "slat", tuple(notes))
-    surface = field
-    if cells is not None:
-        nothing = np.zeros(len(cells), np.uint8), np.ones((len(cells), 3), np.float32)
-        surface = VoxelField(cells, *nothing)
     read, told = _read(gaussians, axes, field, surface)
     vertices = splats.require_gaussians(read.vertices, gaussians)
     return Scene(*own, vertices, read.in_slat(), read.axes, (*notes, *told))

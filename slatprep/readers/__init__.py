@@ -19,7 +19,7 @@ from slatprep.readers.contents import contents_of
 from slatprep.readers.files import ArraySpec, load_source, npy_array, refusing, require_complete
 from slatprep.readers.pairing import discover
 from slatprep.readers.slat import read_slat, texture_of
-from slatprep.readers.slat_files import SlatFile, discover_slats
+from slatprep.readers.slat_files import discover_slats
 from slatprep.records import (
     TRELLIS,
     AssetPair,
@@ -32,7 +32,6 @@ from slatprep.records import (
 )
 
 __all__ = [
-    "SlatFile",
     "contents_of",
     "discover",
     "discover_slats",

@@ -17,7 +17,7 @@ from slatprep.parameters import BuildParameters, SlatSource
 from slatprep.readers.adapters import Holding, adapter_names, latent_adapter, source_adapter
 from slatprep.readers.files import refusing
 from slatprep.readers.plausible import ENOUGH
-from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property, labels_of
+from slatprep.records import Contents, LatentMoments, LatentSpace, Place, Property
 from slatprep.records.encoders import LATENTS
 from slatprep.records.sources import table_of
 from slatprep.records.tables import PROPERTIES
@@ -60,10 +60,6 @@ def contents_of(parameters: BuildParameters) -> Contents:
                 f"{table} ({source.root}): {fault}; expected what [pixieverse] has, or "
                 "a part of it: name the source that has most as [pixieverse]"
             )
-    try:
-        labels_of(held.classes)
-    except ValueError as error:
-        raise ConfigError(f"{parameters.pixieverse.root}: {error}") from None
     return Contents(held.properties, held.classes, latent_space(parameters.slat))
 
 

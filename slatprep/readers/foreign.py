@@ -108,8 +108,8 @@ class ForeignSource(_Foreign):
                 f"{len(names)} properties; expected 1 to {MAX_PROPERTIES}, of a name each",
             )
             named = all(CLASS_NAME.fullmatch(one) for one in classes)
-            few = classes == records.MATERIAL_CLASSES or len(classes) <= records.MANY_BACKGROUND
-            self._require(named and few, f"classes {classes!r}")
+            self._require(named, f"classes {classes!r}")
+            records.labels_of(classes)
             return held
 
     def find(self, source: PixieverseSource, listing: Listing) -> Iterator[Any]:
@@ -166,7 +166,7 @@ class ForeignSource(_Foreign):
             where, values = pair.grid or pair.roots.pixieverse, field.properties.copy()
             material = field.material if field.classified else None
             told = coarse_places(field.voxels, side)
-            told += require_plausible(where, values, material, table, contents.classes, pair.roots)
+            told += require_plausible(where, values, material, table, pair.roots)
             warnings = (*field.warnings, *told)
             field = replace(field, properties=values, warnings=warnings, converted=True)
         for one, column in zip(table, field.properties.T, strict=True):

@@ -115,7 +115,7 @@ def discover(
     found = []
     for k, source in enumerate(sources):
         roots = SourceRoots(
-            places[k], folder, contents, source.adapter, k, (), source.units, source.plausibility
+            places[k], folder, contents, source.adapter, k, source.units, source.plausibility
         )
         found.append(_Found(source, slat, roots, listings[k], each[k], categories, cases))
     pairs = list(_pairs(rows, found))

@@ -104,8 +104,7 @@ class PixieVerse(SourceAdapter):
         voxels = voxels_at(cells)
         properties, classes = _gather(channels, cells), material.reshape(-1)[cells].astype(np.uint8)
         if raw:
-            held = properties, classes, PROPERTIES, MATERIAL_CLASSES
-            warnings += require_plausible(path, *held, pair.roots)
+            warnings += require_plausible(path, properties, classes, PROPERTIES, pair.roots)
         else:
             warnings += require_prediction(path, properties, classes, pair.roots.plausibility)
 

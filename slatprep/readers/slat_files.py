@@ -21,7 +21,10 @@ _UNPACKED = "and SLATs are read unpacked: `tar -xf ARCHIVE -C FOLDER`, then poin
 
 @dataclass(frozen=True, slots=True)
 class NamedSlat:
-    """A SLAT and the names it was found by; `path` is empty if only a map of ids names it."""
+    """A SLAT and the names it was found by; `path` is relative to the folder of all SLATs.
+
+    It is empty if only a map of ids names the SLAT. `problem` says why it cannot be used.
+    """
 
     slat_id: str
     view: str
@@ -30,21 +33,7 @@ class NamedSlat:
     problem: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class SlatFile:
-    """A SLAT without a partner: its id, its file, the folder that holds it, and its group.
-
-    `problem` says why it cannot be used; it is empty if it can.
-    """
-
-    asset_id: str
-    path: Place
-    root: Place
-    group: str = ""
-    problem: str = ""
-
-
-def discover_slats(source: SlatSource) -> list[SlatFile]:
+def discover_slats(source: SlatSource) -> tuple[Place, dict[str, NamedSlat]]:
     """Find SLATs that need no partner.
 
     Parameters
@@ -54,7 +43,9 @@ def discover_slats(source: SlatSource) -> list[SlatFile]:
 
     Returns
     -------
-    list of SlatFile
+    Place
+        The folder that their paths begin at.
+    dict of str to NamedSlat
         Sorted by id, ``<id>`` or ``<id>.<view>``, each once. The name of a single file
         is its id.
 
@@ -75,13 +66,12 @@ def discover_slats(source: SlatSource) -> list[SlatFile]:
         slats = slats or [NamedSlat(root.name.rpartition(".")[0], "", root.name)]
     else:
         slats = [slat for found in find_slats(source, False).values() for slat in found]
-    folder, named = root.parent if one_file else root, dict[str, SlatFile]()
+    named: dict[str, NamedSlat] = {}
     for slat in ordered(slats):
         asset_id = encoded(f"{slat.slat_id}.{slat.view}" if slat.view else slat.slat_id)
         twice = f"two SLATs have the id {asset_id!r}" if asset_id in named else ""
-        problem = slat.problem or twice
-        named[asset_id] = SlatFile(asset_id, folder / slat.path, folder, slat.group, problem)
-    return [named[asset_id] for asset_id in sorted(named)]
+        named[asset_id] = replace(slat, problem=slat.problem or twice)
+    return root.parent if one_file else root, dict(sorted(named.items()))
 
 
 def find_slats(source: SlatSource, one_file: bool) -> dict[str, list[NamedSlat]]:

@@ -59,20 +59,20 @@ def require_plausible(
     values: NDArray[np.floating],
     material: NDArray[Any] | None,
     table: Sequence[Property],
-    classes: Sequence[str],
     roots: SourceRoots,
     bare: Units = UNSTATED,
 ) -> list[str]:
     """Convert values (K, P) to SI units in place; compare them, by class (K,), with materials.
 
-    `roots` state the units of the values, `bare` those of what they do not state: SI by default.
-    An SI unit in `bare` is one that the file itself states, and no setting is advised for it.
-    Returns warnings; raises `InputError` if most voxels are implausible and `roots.plausibility` is
-    ``refuse``. Checking for NaN and other invalid values is left to the reader.
+    `roots` name the classes and state the units of the values; `bare` are the units of what they do
+    not state, SI by default. An SI unit in `bare` is one that the file itself states, and no
+    setting is advised for it. Returns warnings; raises `InputError` if most voxels are implausible
+    and `roots.plausibility` is ``refuse``. Checking for NaN and other invalid values is left to the
+    reader.
     """
     now = units_now(roots.units, bare)
     checked = roots.plausibility != "off" and len(values) > 0
-    read = _parts(values, material, table, classes) if checked else []
+    read = _parts(values, material, table, roots.contents.classes) if checked else []
     for column, one in enumerate(table):
         if (unit := now.get(one.name, one.unit)) != one.unit:
             with np.errstate(over="ignore"):

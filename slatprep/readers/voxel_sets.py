@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slatprep import records
 from slatprep.errors import InputError
-from slatprep.geometry.voxels import flat_index, voxels_of
+from slatprep.geometry.voxels import flat_index, occupancy_of, shown_in_cells, voxels_at
 from slatprep.normalize import from_mapped, to_mapped
 from slatprep.readers.plausible import UNSTATED, coarse_places
 from slatprep.readers.values import require_plausible
@@ -26,12 +26,10 @@ def field_of_voxels(
     roots: records.SourceRoots,
     resolution: int = records.RESOLUTION,
     material: NDArray[Any] | None = None,
-    classes: int = records.BACKGROUND,
     table: Sequence[records.Property] = records.PROPERTIES,
     max_unphysical: float = 0.0,
     sources: Sequence[records.SourceFile] = (),
     frame: NDArray[np.float64] | None = None,
-    names: Sequence[str] = (),
     description: str = "",
     bare: records.Units = UNSTATED,
 ) -> records.MaterialField:
@@ -40,17 +38,16 @@ def field_of_voxels(
     Points lie in the unit cube [-0.5, 0.5]^3. `properties` (K, P) have a column for each entry of
     `table`, in SI units or in those that `roots`, the pair's, state; these also say how implausible
     values are treated. `bare` are the units of what `roots` do not state, by default SI units; an
-    SI unit named here is one that the file states, and is not doubted. `material` (K,) are class
-    ids, all 0 by default, or -1 for an occupied voxel without a class; `classes` counts them, at
-    most 254. Errors call the source `where`.
+    SI unit named here is one that the file states, and is not doubted. `material` (K,) are ids of
+    the classes of `roots`, all 0 by default, or -1 for an occupied voxel without a class. Errors
+    call the source `where`.
 
     Cells of a grid coarser than 64^3 stay whole. From a finer grid or points, each cell takes its
     voxels' most frequent class (the lowest at a tie) and the mean properties of that class's
     voxels. The mean is in log10 for properties that are normalised in log10. InputError if there is
-    no voxel, one is out of range, or too many are unphysical. `names` are the classes' names, by
-    default those of `roots`. If a file `description` states the resolution, an integer voxel may
-    not occur twice with different values. Integer voxels that fill only an eighth of the grid give
-    a warning.
+    no voxel, one is out of range, or too many are unphysical. If a file `description` states the
+    resolution, an integer voxel may not occur twice with different values. Integer voxels that fill
+    only an eighth of the grid give a warning.
     """
     cells, resolution = _cells_of(where, np.asarray(voxels), resolution)
     count, notes = len(cells), list[str]()
@@ -63,9 +60,10 @@ def field_of_voxels(
         own = given.astype(np.int64)
     if given.shape != (count,):
         raise InputError(where, f"has material {given.shape}", f"({count},)")
-    if (unknown := (own < -1) | (own >= classes) | (own != given)).any():
+    last = len(roots.contents.labels) - 1
+    if (unknown := (own < -1) | (own > last) | (own != given)).any():
         row = int(np.argmax(unknown))
-        expected = f"classes 0 to {classes - 1}, or -1 for an occupied voxel without one"
+        expected = f"classes 0 to {last}, or -1 for an occupied voxel without one"
         raise InputError(where, f"has class {given[row]:g} in row {row}", expected)
     if len(classed := np.flatnonzero(own >= 0)) == 0:
         raise InputError(where, f"has no class in any of {count} rows", "a voxel with a class")
@@ -75,8 +73,7 @@ def field_of_voxels(
         raise InputError(where, f"has properties {shape}", f"({count}, {len(table)})")
     exact = np.asarray(properties)[classed].astype(np.float64)
     labelled = None if material is None else own[classed]
-    names = names or roots.contents.classes
-    notes += require_plausible(where, exact, labelled, table, names, roots, bare)
+    notes += require_plausible(where, exact, labelled, table, roots, bare)
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, an error later
         known = exact.astype(np.float32)
 
@@ -96,18 +93,12 @@ def field_of_voxels(
         if whole and description:
             _require_alike(where, keep, flat_index(index[keep], resolution), own[keep], values)
         notes.append(f"{len(keep)} voxels were merged into {len(cell)} of {side}^3")
-    there = np.full(side**3, -1, dtype=np.int64)
-    there[flat] = len(cell)  # occupied, annotated or not
-    there[cell] = np.arange(len(cell))
-    # A cell of the 64^3 grid takes the source's cell at its centre.
-    steps = (2 * np.arange(records.RESOLUTION) + 1) * side // (2 * records.RESOLUTION)
-    rows = there.reshape((side,) * 3)[np.ix_(steps, steps, steps)]
-    annotated = (rows >= 0) & (rows < len(cell))
+    annotated, rows = shown_in_cells(voxels_at(cell, (side,) * 3), side)
     return records.MaterialField(
-        occupancy=rows >= 0,
-        voxels=voxels_of(annotated),
-        material=labels[rows[annotated]].astype(np.uint8),
-        properties=means[rows[annotated]],
+        occupancy=occupancy_of(cells, side),
+        voxels=annotated,
+        material=labels[rows].astype(np.uint8),
+        properties=means[rows],
         unphysical=len(classed) - len(keep),
         sources=tuple(sources),
         warnings=tuple(notes),

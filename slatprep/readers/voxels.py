@@ -147,12 +147,10 @@ class PlainVoxels(SourceAdapter):
             np.stack(columns, axis=1),
             resolution=said.resolution,
             material=arrays.get("material"),
-            classes=len(records.labels_of(said.names)) or 1,
             table=said.table,
             max_unphysical=max_unphysical,
             sources=(file, about),
             frame=np.eye(4) if said.aligned else None,
-            names=said.names,
             roots=pair.roots,
             description=DESCRIPTION,
         )

@@ -139,9 +139,8 @@ def table_of(number: int) -> str:
 class SourceRoots:
     """The root folders of a source and of the latents, and what they hold.
 
-    ``number`` is the source's index from 0; the first one names the others in ``also``.
-    ``units`` are the units of its files; ``plausibility`` is the treatment of values that no
-    material has.
+    ``number`` is the source's index from 0. ``units`` are the units of its files; ``plausibility``
+    is the treatment of values that no material has.
     """
 
     pixieverse: Place
@@ -149,7 +148,6 @@ class SourceRoots:
     contents: Contents = PIXIEVERSE
     adapter: str = "pixieverse"
     number: int = 0
-    also: tuple[SourceRoots, ...] = ()
     units: Units = field(default_factory=Units)
     plausibility: Plausibility = "refuse"
 

@@ -366,7 +366,7 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path):
     coords = write_prediction(tmp_path / "p.npz")
     stuff = np.tile(np.float32(JELLY[1:]), (len(coords), 1))
     field = VoxelField(coords.astype(np.uint8), np.zeros(len(coords), np.uint8), stuff)
-    scene = motion.prepare(field, None, None, None, 8)
+    scene = motion.prepare(field, None, None, 8)
     for count in (3, 2):
         moved = np.repeat(scene.positions[None], count, axis=0)
         gradients = np.tile(np.eye(3, dtype=np.float32), (*moved.shape[:2], 1, 1))
@@ -385,7 +385,7 @@ def test_a_run_that_is_stopped_keeps_the_frames_it_has_not_replaced(tmp_path):
     coords = write_prediction(tmp_path / "p.npz")
     stuff = np.tile(np.float32(JELLY[1:]), (len(coords), 1))
     field = VoxelField(coords.astype(np.uint8), np.zeros(len(coords), np.uint8), stuff)
-    scene, out = motion.prepare(field, None, None, None, 8), tmp_path / "frames"
+    scene, out = motion.prepare(field, None, None, 8), tmp_path / "frames"
 
     def stop(done: int, total: int) -> None:
         if (done, total) == (1, 2):
@@ -452,13 +452,13 @@ def test_what_is_given_for_the_whole_object_is_taken(tmp_path, monkeypatch):
     coords = write_prediction(tmp_path / "p.npz").astype(np.uint8)
     stuff = np.tile(np.float32(JELLY[1:]), (len(coords), 1))
     field = VoxelField(coords, np.zeros(len(coords), np.uint8), stuff)
-    scene = motion.prepare(field, None, None, None, 32, material="metal", young=7e6, density=9e2)
+    scene = motion.prepare(field, None, None, 32, material="metal", young=7e6, density=9e2)
     assert set(scene.material.tolist()) == {METAL[0]}
     expected = [7e6, 9e2, JELLY[3]]
     np.testing.assert_allclose(scene.properties, np.tile(expected, (len(scene.positions), 1)))
-    (told,) = motion.prepare(field, None, None, None, 10).notes
-    volume = len(motion.prepare(field, None, None, None, 64).positions) / 64**3
-    share = len(motion.prepare(field, None, None, None, 10).positions) / 10**3 / volume
+    (told,) = motion.prepare(field, None, None, 10).notes
+    volume = len(motion.prepare(field, None, None, 64).positions) / 64**3
+    share = len(motion.prepare(field, None, None, 10).positions) / 10**3 / volume
     assert told.startswith(f"the particles fill {share:.3g} times the object's volume")
 
     def still(

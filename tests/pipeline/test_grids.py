@@ -23,7 +23,6 @@ from slatprep.learn.train import TrainParameters, train
 from slatprep.parameters import WitnessParameters
 from slatprep.parameters.files import load_parameters
 from slatprep.particles.fields import predicted_field, stored_field
-from slatprep.particles.motion import cells_of
 from slatprep.pipeline.join import subset_store
 from slatprep.readers.splits import Shares
 from slatprep.records import BACKGROUND
@@ -112,7 +111,7 @@ def test_its_points_are_the_voxels_centres(demo, tmp_path):
     near = tree.query_ball_point(centres_of(field.voxels, field.resolution), reach)
     material = asset.material[asset.valid]
     assert all(field.material[k] in material[some] for k, some in enumerate(near))
-    cells = centres_of(cells_of(demo / "s.zarr", asset.asset_id), 64)
+    cells = centres_of(stored_field(store, asset.asset_id, "grid").surface, 64)
     assert tree.query(cells)[0].max() < 0.5 / min(side, 64) * np.sqrt(3) + 1e-9
 
 

@@ -407,9 +407,8 @@ def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equ
     voxels = np.unique(rng.integers(0, 24, (9000, 3)), axis=0)
     material = rng.integers(0, 254, 6)[rng.integers(0, 6, len(voxels))]
     values = rng.uniform(0.1, 0.4, (len(voxels), 3))
-    field = field_of_voxels(
-        "here", voxels, values, resolution=side, material=material, classes=254, roots=UNCHECKED
-    )
+    roots = replace(UNCHECKED, contents=Contents(classes=tuple(class_names(254))))
+    field = field_of_voxels("here", voxels, values, resolution=side, material=material, roots=roots)
     for place, own, properties in zip(field.voxels, field.material, field.properties, strict=True):
         inside = (np.floor((voxels + 0.5) * 64 / side) == place).all(axis=1)
         if side < 64:  # A cell takes the voxel at its centre.

@@ -19,7 +19,7 @@ from slatprep.errors import InputError
 from slatprep.parameters.files import load_parameters
 from slatprep.readers import discover, hash_sources, read_field
 from slatprep.readers.values import require_plausible, require_prediction
-from slatprep.records import PROPERTIES, MaterialField, SourceRoots, Units
+from slatprep.records import PROPERTIES, Contents, MaterialField, SourceRoots, Units
 
 JELLY, METAL, SAND, VISPLAS, FLUID, SNOW, STATIONARY = range(7)
 
@@ -212,13 +212,14 @@ def test_what_is_unusual_or_of_few_voxels_is_told_and_taken(read):
 
 
 def test_of_many_classes_the_object_is_looked_at_as_a_whole():
-    classes, roots = [f"c{k}" for k in range(25)], SourceRoots(Path("/a"), Path("/b"))
-    material = np.arange(1000) % len(classes)
+    contents = Contents(classes=tuple(f"c{k}" for k in range(25)))
+    roots = SourceRoots(Path("/a"), Path("/b"), contents)
+    material = np.arange(1000) % len(contents.classes)
     values = np.tile(np.array([[2e-3, 930, 0.49]], np.float32), (1000, 1))
     with pytest.raises(InputError, match=r"look like GPa.*: the object has Young's modulus"):
-        require_plausible("x", values, material, PROPERTIES, classes, roots)
+        require_plausible("x", values, material, PROPERTIES, roots)
     values[:, 0] = 2e6
-    assert require_plausible("x", values, material, PROPERTIES, classes, roots) == []
+    assert require_plausible("x", values, material, PROPERTIES, roots) == []
     with pytest.raises(InputError, match="is normalised"):
         require_prediction("x", np.full((1000, 3), 1e6), material)
 

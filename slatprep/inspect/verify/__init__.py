@@ -102,7 +102,7 @@ def verify_store(
     *,
     manifests: Place | None = None,
     sources: bool = False,
-    roots: SourceRoots | None = None,
+    roots: Sequence[SourceRoots] = (),
     sample: int | None = None,
     jobs: Jobs = 1,
     progress: Progress | None = None,
@@ -117,8 +117,8 @@ def verify_store(
         Folder of the build's records; by default the one beside the store, if it exists.
     sources : bool
         Whether to compare the source files with the records.
-    roots : SourceRoots, optional
-        Where the sources are now; by default the roots in ``build.json``.
+    roots : sequence of SourceRoots, optional
+        Where each source is now, in their order; by default the roots in ``build.json``.
     sample : int, optional
         Compare values, records and sources of only this many assets, evenly chosen.
         Metadata, files and the ``asset/*`` arrays are always compared whole.
@@ -155,8 +155,8 @@ def verify_store(
         return Verification(path, 0, 0, 0, None, (finding,))
     folder = manifests or found_manifests(path, store.about.manifest)
     if sources:
-        roots = source_roots(folder) if roots is None else moved(roots, folder)
-    needed = [roots.slat, *(one.pixieverse for one in (roots, *roots.also))] if roots else []
+        roots = moved(roots, folder) if roots else source_roots(folder)
+    needed = [place for one in roots for place in (one.slat, one.pixieverse)]
     require_shared(jobs, [store.path / "zarr.json", *needed])
     findings = set(metadata_findings(path))
     files, found = file_findings(store, jobs)
@@ -170,7 +170,7 @@ def verify_store(
         findings.add(Finding("asset", "", str(error), "readable ids and offsets"))
         rows = []
     hashed, total = 0, len(rows)
-    source, compared = SourceStore(store), roots if sources else None
+    source, compared = SourceStore(store), roots if sources else ()
     tasks = ((source, row, compared) for row in rows)
     for own, count in counted(run_unordered(asset_findings, tasks, jobs), total, progress):
         findings |= set(own)

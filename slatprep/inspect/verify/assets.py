@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -50,11 +50,11 @@ round sums differently."""
 
 
 def asset_findings(
-    source: SourceStore, row: int, roots: SourceRoots | None
+    source: SourceStore, row: int, roots: Sequence[SourceRoots]
 ) -> tuple[list[Finding], int]:
     """Return the faults of an asset of a store, and the number of its sources compared.
 
-    Sources are compared only if `roots` is given.
+    Sources are compared only if `roots` are given.
     """
     asset_id, findings, compared = source.ids[row], list[Finding](), 0
     where, expected = "asset", "an asset that can be read"
@@ -67,7 +67,7 @@ def asset_findings(
         findings += record_findings(asset, record, source.text(row))
         if sound:  # Confidence cannot be computed from invalid values.
             findings += confidence_findings(asset, record)
-        if roots is not None:
+        if roots:
             where, expected = "sources", "those that the store was made from"
             changed, compared = list(source_findings(record, roots, source)), len(record.sources)
             findings += changed
@@ -195,16 +195,16 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
 
 
 def source_findings(
-    record: AssetRecord, roots: SourceRoots, store: SourceStore
+    record: AssetRecord, roots: Sequence[SourceRoots], store: SourceStore
 ) -> Iterator[Finding]:
     """Yield findings on sources that are missing or differ from the record."""
     for source in record.sources:
-        if source.source > len(roots.also):
+        if source.source >= len(roots):
             what = f"{source.path} is of {table_of(source.source)}, whose root is not known"
             yield Finding("sources", record.asset_id, what, "its root, by --also")
             continue
-        own = (roots, *roots.also)[source.source]
-        root = roots.slat if source.role in LATENT_ROLES else own.pixieverse
+        own = roots[source.source]
+        root = own.slat if source.role in LATENT_ROLES else own.pixieverse
         path = root / source.path
         expected = f"SHA-256 {source.sha256}"
         try:
@@ -227,7 +227,7 @@ def source_findings(
 
 
 def merged_findings(
-    asset: StoredAsset, record: AssetRecord, roots: SourceRoots
+    asset: StoredAsset, record: AssetRecord, roots: Sequence[SourceRoots]
 ) -> Iterator[Finding]:
     """Yield findings where merged labels differ from a new merge by sources and alignments."""
     latents, contents = asset.latents, asset.store.contents
@@ -260,13 +260,13 @@ def merged_findings(
 
 
 def _pair_of(
-    asset: StoredAsset, record: AssetRecord, one: Contribution, roots: SourceRoots
+    asset: StoredAsset, record: AssetRecord, one: Contribution, roots: Sequence[SourceRoots]
 ) -> AssetPair:
     """Return the pair of one annotation, with the present places of its files."""
     found = [record.sources[k] for k in one.sources]
-    own = (roots, *roots.also)[found[0].source]
+    own = roots[found[0].source]
     files = {file.role: own.pixieverse / file.path for file in found}
-    slat = next(roots.slat / file.path for file in record.sources if file.role == "slat")
+    slat = next(own.slat / file.path for file in record.sources if file.role == "slat")
     return AssetPair(
         record.asset_id,
         record.object_id,

@@ -29,8 +29,8 @@ _MOST_LINES = 8
 _OWN = "the store's: name the folder of its records with --manifests, or build again"
 
 
-def source_roots(manifests: Place | None) -> SourceRoots:
-    """Return the roots of the sources at the time of the build.
+def source_roots(manifests: Place | None) -> Sequence[SourceRoots]:
+    """Return the roots of each source at the time of the build.
 
     Raises StoreError if no record names them, or they no longer exist.
     """
@@ -47,8 +47,8 @@ def source_roots(manifests: Place | None) -> SourceRoots:
     except (OSError, StoreError) as error:
         raise StoreError(f"{manifests / BUILD}: names no sources ({error}); {advice}") from None
     if not gone:
-        first, *also = [SourceRoots(one.root, slat, number=k) for k, one in enumerate(sources)]
-        return moved(replace(first, also=tuple(also)), manifests)
+        named = [SourceRoots(one.root, slat, number=k) for k, one in enumerate(sources)]
+        return moved(named, manifests)
     text = str(build.parameters.pixieverse.root)
     if APART in text:
         raise StoreError(
@@ -60,7 +60,7 @@ def source_roots(manifests: Place | None) -> SourceRoots:
     raise StoreError(f"{manifests / BUILD}: its sources are not at {gone[0]} any more; {advice}")
 
 
-def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
+def moved(roots: Sequence[SourceRoots], manifests: Place | None) -> Sequence[SourceRoots]:
     """Return moved roots, with adapters, units and plausibility as the build's record says."""
     try:
         build = None if manifests is None else build_in(manifests).parameters
@@ -68,8 +68,8 @@ def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
         build = None  # `manifest_findings` reports the fault.
     if build is None:
         return roots
-    sources = zip((roots, *roots.also), (build.pixieverse, *build.also), strict=False)
-    first, *also = [
+    sources = zip(roots, (build.pixieverse, *build.also), strict=False)
+    return [
         replace(
             one,
             adapter=source.adapter,
@@ -79,7 +79,6 @@ def moved(roots: SourceRoots, manifests: Place | None) -> SourceRoots:
         )
         for one, source in sources
     ]
-    return replace(first, also=tuple(also))
 
 
 def manifest_findings(

@@ -336,13 +336,13 @@ def test_what_build_json_says_of_the_store_is_compared(store):
 def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
     own = Path(shutil.copytree(mixed.root, tmp_path / "own"))
     roots = SourceRoots(own / "pixieverse", own / "slat")
-    result = verify_store(store, sources=True, roots=roots)
+    result = verify_store(store, sources=True, roots=[roots])
     assert result.ok
     assert result.sources == 10
     grid, slat = roots.pixieverse / "ant/sample_0/material_grid.npy", roots.slat / "cup.npz"
     flip(grid, 1000)
     slat.unlink()
-    assert [(f.file, f.asset, f.what) for f in found(store, sources=True, roots=roots)] == [
+    assert [(f.file, f.asset, f.what) for f in found(store, sources=True, roots=[roots])] == [
         (str(grid), "ant", "its bytes changed"),
         (str(slat), "cup", "does not exist"),
     ]
@@ -351,20 +351,20 @@ def test_changed_and_missing_sources_are_found(store, mixed, tmp_path):
 def test_a_second_look_remembers_nothing_of_the_first(store, mixed, tmp_path):
     roots = SourceRoots(mixed.root / "pixieverse", tmp_path / "slat")
     shutil.copytree(mixed.root / "slat", roots.slat)
-    assert verify_store(store, roots=roots, sources=True).ok
+    assert verify_store(store, roots=[roots], sources=True).ok
     slat = roots.slat / "ant.npz"
     times = slat.stat().st_atime_ns, slat.stat().st_mtime_ns
     flip(slat, 300)
     os.utime(slat, ns=times)
     rewrite(store, "asset/id", 4, "zebra")
-    findings = found(store, roots=roots, sources=True)
+    findings = found(store, roots=[roots], sources=True)
     assert {"its bytes changed"} <= {f.what for f in of_file(findings, str(slat))}
     assert any(finding.asset == "zebra" for finding in findings)
 
 
 def test_the_files_of_a_store_are_closed_after_its_sources_were_compared(store, mixed):
     roots = SourceRoots(mixed.root / "pixieverse", mixed.root / "slat")
-    assert verify_store(store, roots=roots, sources=True).ok
+    assert verify_store(store, roots=[roots], sources=True).ok
     gc.collect()
     opened = [path.readlink() for path in Path("/proc/self/fd").iterdir() if path.is_symlink()]
     assert not [path for path in opened if path.is_relative_to(store)]
