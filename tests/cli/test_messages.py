@@ -249,6 +249,7 @@ def test_sources_of_a_joined_store_are_said_to_lie_apart(store, mixed, tmp_path)
     build_store(other.parameters(), tmp_path / "elk.zarr")
     both = tmp_path / "both.zarr"
     run("concat", store, tmp_path / "elk.zarr", "--out", both)
+    assert open_store(both).ids == [*open_store(store).ids, "elk"]
     told = refused("verify", both, "--sources", code=1)
     assert len(told.splitlines()) == 1
     assert "sources lie apart" in told and str(pixieverse) in told

@@ -188,20 +188,6 @@ def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):
     assert not out.exists()
 
 
-def test_commands_choose_and_join(mixed_build, tmp_path):
-    store, both, good = (tmp_path / f"{name}.zarr" for name in ("mixed", "both", "good"))
-    shutil.copytree(mixed_build.store, store)  # without the records beside it
-    one, two = tmp_path / "one.zarr", tmp_path / "two.zarr"
-    run("subset", store, "--out", one, "--asset", "an")
-    run("subset", store, "--out", two, "--asset", "bear.s", "--asset", "d")
-    run("concat", one, two, "--out", both, "--json")
-    assert open_store(both).ids == ["ant", "bear.side", "dog"]
-    assert verify_store(both).ok
-    run("subset", store, "--verdict", "good", "--out", good)
-    assert len(open_store(good)) == 5
-    run("subset", store, "--out", "x.zarr", code=2)
-
-
 def test_a_source_is_never_replaced_whatever_path_leads_there(folder, tmp_path, monkeypatch):
     shutil.copytree(folder / "ac.zarr", tmp_path / "own.zarr")
     before = tree(tmp_path / "own.zarr")

@@ -14,7 +14,7 @@ import pytest
 from support.memory import less_than
 from support.published import BLOCK, IDS, add, add_link, pack, parameters, write_object, writing
 from support.synthetic import make_asset
-from support.trees import records_of, tree
+from support.trees import tree
 
 from slatprep import InputError, StoreError, build_store, discover, open_store, read_field
 from slatprep.inspect.verify import verify_store
@@ -31,22 +31,31 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-@pytest.mark.parametrize(
-    "root", ["pixieverse", "tar", "tar/archives", "gz/archives/render_outputs"]
-)
+@pytest.mark.parametrize("root", ["tar", "gz/archives/render_outputs"])
 def test_store_of_archives_is_that_of_the_unpacked_folder(made, tmp_path, unpacked, root):
-    summary = build_store(parameters(made, root, root == "pixieverse"), tmp_path / "s.zarr")
+    summary = build_store(parameters(made, root), tmp_path / "s.zarr")
     assert summary.statuses == {"ok": 4, "failed": 0, "skipped": 1}
     assert tree(tmp_path / "s.zarr") == unpacked
     assert verify_store(tmp_path / "s.zarr", sources=True).ok
 
 
+def test_from_any_folder_above_them_archives_and_grids_are_the_same(made):
+    for roots, listed in (
+        (("pixieverse/render_outputs", "pixieverse"), True),
+        (("tar/archives/render_outputs", "tar/archives", "tar"), False),
+    ):
+        found = [list(discover(parameters(made, root, listed))) for root in roots]
+        for pairs in zip(*found, strict=True):
+            told = {(one.asset_id, one.category, str(one.grid), one.problem) for one in pairs}
+            assert len(told) == 1
+            assert pairs[0].problem or len({read_field(one).sources for one in pairs}) == 1
+
+
 @pytest.mark.parametrize("path", [TAR, GZ])
-def test_one_archive_holds_its_class(made, tmp_path, path):
-    build_store(parameters(made, path), tmp_path / "s.zarr")
-    store = open_store(tmp_path / "s.zarr")
-    assert list(store.ids) == [IDS[0], IDS[3]]
-    assert set(store.column("category")) == {"tree"}
+def test_one_archive_holds_its_class(made, path):
+    pairs = [one for one in discover(parameters(made, path)) if not one.problem]
+    assert [one.asset_id for one in pairs] == [IDS[0], IDS[3]]
+    assert {one.category for one in pairs} == {"tree"} and len(read_field(pairs[1]).voxels)
 
 
 def test_needed_members_alone_are_read_once(objects, made, tmp_path, monkeypatch, files_are_old):
@@ -132,7 +141,7 @@ def grid_of(objects: Path, number: int) -> Path:
     return objects / IDS[number] / "sample_0" / "material_grid.npy"
 
 
-def test_last_of_two_members_counts_and_links_stay_in_the_archive(objects, made, strange, tmp_path):
+def test_last_of_two_members_counts_and_links_stay_in_the_archive(objects, made, strange):
     name = f"{IDS[0]}/sample_0/material_grid.npy"
     with writing(strange / "tree.tar") as archive:
         archive.add(grid_of(objects, 1), arcname=f"./{name}")
@@ -143,24 +152,24 @@ def test_last_of_two_members_counts_and_links_stay_in_the_archive(objects, made,
         for other in ("/etc/passwd", f"../{IDS[4]}/sample_0/material_grid.npy"):
             archive.addfile(tarfile.TarInfo(other))
     told: list[str] = []
-    summary = build_store(parameters(made, strange), tmp_path / "s.zarr", note=told.append)
-    problems = dict(summary.problems)
+    pairs = {one.asset_id: one for one in discover(parameters(made, strange), told.append)}
     digest = hashlib.sha256(grid_of(objects, 0).read_bytes()).hexdigest()
-    records = records_of(summary.records)
-    grids = {name: r["sources"][0]["sha256"] for name, r in records.items() if "sources" in r}
-    assert grids == {IDS[0]: digest, IDS[1]: digest}
+    for one in IDS[:2]:
+        assert read_field(pairs[one]).sources[0].sha256 == digest
+    for one, said in zip(IDS[2:4], ("is a symbolic link", "is a device or a pipe"), strict=True):
+        with pytest.raises(InputError, match=said):
+            read_field(pairs[one])
     (line,) = [line for line in told if "twice" in line]
     assert "tree.tar: 1 name" in line and "'/etc/passwd' and 1 more" in line
-    assert "is a symbolic link" in problems[IDS[2]]
-    assert "is a device or a pipe" in problems[IDS[3]]
 
 
-def test_object_in_two_archives_is_not_taken_from_either(objects, made, strange, tmp_path):
+def test_object_in_two_archives_is_not_taken_from_either(objects, made, strange):
     pack(strange / "sand.tar", [objects / IDS[0], objects / IDS[1]])
     pack(strange / "tree.tar", [objects / IDS[0]])
-    summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
-    assert f"lies in {strange / 'sand.tar'} as well" in dict(summary.problems)[IDS[0]]
-    assert list(open_store(tmp_path / "s.zarr").ids) == [IDS[1]]
+    both, one, *_ = discover(parameters(made, strange))
+    with pytest.raises(InputError, match=f"lies in {strange / 'sand.tar'} as well"):
+        read_field(both)
+    assert len(read_field(one).voxels)
 
 
 @pytest.mark.parametrize("suffix", [".tar", ".tar.gz"])
@@ -252,31 +261,29 @@ COMMENT = header(30, tarfile.XHDTYPE) + b"30 comment=aaaaaaaaaaaaaaaaaa\n".ljust
 ], ids=[
     "negative", "huge", "negative by pax", "nested", "large", "long name", "no header", "cut",
 ])  # fmt: skip
-def test_strange_headers_end_one_archive(objects, made, strange, tmp_path, suffix, behind, said):
-    pack(strange / "a.tar", [objects / IDS[0]])
-    pack(tmp_path / "b", [objects / IDS[1]])
-    with tarfile.open(tmp_path / "b") as archive:
-        archive.getmembers()
-        sound = (tmp_path / "b").read_bytes()[: archive.offset]
-    plain = sound + behind + bytes(10 * BLOCK) * bool(behind)
-    packed = gzip.compress(plain) if suffix == ".tar.gz" else plain
-    (strange / f"b{suffix}").write_bytes(packed)
+def test_strange_headers_end_one_archive(strange, suffix, behind, said):
+    with writing(strange / "sound.tar") as archive:
+        add(archive, "a/grid.npy", b"grid")
+        end = archive.offset
+    plain = (strange / "sound.tar").read_bytes()[:end] + behind + bytes(10 * BLOCK) * bool(behind)
+    path = strange / f"b{suffix}"
+    path.write_bytes(gzip.compress(plain) if suffix == ".tar.gz" else plain)
+    made = Archive.on_disk(path, ("*/grid.npy",))
     with less_than(300e6):
-        summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
-    (line,) = [text for about, text in summary.problems if about.startswith("b.tar")]
-    assert re.search(said, line) and "download it again" in line
-    assert open_store(tmp_path / "s.zarr").ids == [IDS[0], IDS[1]]
+        index = made.index()
+    assert re.search(said, index.fault) and "download it again" in index.fault
+    assert made.read(index.members["a/grid.npy"]) == b"grid"
 
 
-def test_a_gzip_archive_of_a_wrong_checksum_gives_nothing(objects, made, strange, tmp_path):
+def test_a_gzip_archive_of_a_wrong_checksum_gives_nothing(objects, made, strange):
     pack(strange / "a.tar", [objects / IDS[0]])
     path = strange / "b.tar.gz"
     pack(path, [objects / IDS[1]])
     path.write_bytes(other_bit(path.read_bytes()))
-    summary = build_store(parameters(made, strange), tmp_path / "s.zarr")
-    (line,) = [text for about, text in summary.problems if about == path.name]
+    pairs = discover(parameters(made, strange))
+    (line,) = [one.problem for one in pairs if one.asset_id == path.name]
     assert "is no intact tar archive (CRC check failed" in line and "download it again" in line
-    assert open_store(tmp_path / "s.zarr").ids == [IDS[0]]
+    assert [one.asset_id for one in pairs if one.grid] == [IDS[0], path.name]
 
 
 def test_no_flipped_bit_of_a_gzip_archive_changes_a_file(strange):
