@@ -37,6 +37,8 @@ def _run(step: str, number: signal.Signals, line: list[str], said: Path, lost: b
             with suppress(KeyboardInterrupt) if lost else nullcontext():
                 os.kill(os.getpid(), number)
 
+    # Tests that run in the background ignore it, and a command then keeps ignoring it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     prepare_stop()
     inject(pytest.MonkeyPatch(), reached)
     slatprep(line, prog_name="slatprep")
