@@ -13,7 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, require_one_of
 from slatprep.export import target
 from slatprep.export.ply import UNITS, VERTEX, has_comment, write_points
 from slatprep.geometry.voxels import filled, occupancy_of
@@ -68,6 +68,9 @@ def transfer(
     A particle without a voxel within `max_distance` voxels is far. It gets class 7 and properties 0
     (background), no row (drop), or the nearest voxel's material (nearest).
     """
+    require_one_of("far", far, get_args(Far))
+    if not max_distance > 0:
+        raise ConfigError(f"max_distance is {max_distance}; expected a number above 0")
     distance, used = field.nearest(points)
     near = distance <= max_distance
     taken = near | (far == "nearest")
