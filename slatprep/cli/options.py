@@ -6,7 +6,7 @@ import dataclasses
 import math
 import pkgutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -15,7 +15,7 @@ import click
 
 from slatprep.cli.output import Output
 from slatprep.cli.signature import Click, NewPath, SomePath
-from slatprep.errors import amount, first_of, tally
+from slatprep.errors import StoreError, amount, first_of, tally
 from slatprep.storage.place import is_place, place_of, storage_of
 
 if TYPE_CHECKING:
@@ -184,9 +184,10 @@ def complete_asset(
     from slatprep.store.reader import is_store
 
     # If an option still lacks its value, the arguments are not parsed yet.
-    for word in (*map(context.params.get, ("store", "named")), *context.args):
-        if word is not None and is_store(Path(word)):
-            return [known for known in open_store(word).ids if known.startswith(incomplete)]
+    with suppress(StoreError):
+        for word in (*map(context.params.get, ("store", "named")), *context.args):
+            if word is not None and is_store(Path(word)):
+                return [known for known in open_store(word).ids if known.startswith(incomplete)]
     return []
 
 

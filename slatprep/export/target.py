@@ -20,10 +20,6 @@ FORMAT_VERSION = 1
 INDEX = "index.json"
 """Name of the file that lists the contents of an exported folder."""
 
-_WHOLE = "{} is the old export or the new one, whole; run it again"
-_HALF = "{} holds files of the old export, the new one, or both; run it again"
-"""State of a folder whose replacement ended midway: without other files in it, and with them."""
-
 
 @contextmanager
 def directory(out: Path, kind: str) -> Iterator[Path]:
@@ -37,23 +33,21 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
     # A link stays; its target is replaced.
     out = out.resolve()
     # The finished assets of an interrupted build to this path stay.
-    with scratch_beside(out, "export") as scratch, writing(str(out), out.parent):
+    work = scratch_beside(out, "export")
+    with _telling_if_stopped() as told, work as scratch, writing(str(out), out.parent):
         own = _files_of_export(out, kind)
         new = scratch / "export"
         new.mkdir()
         yield new
-        others = set(_names_below(out)) - own if out.exists() else set()
-        try:
-            if others:
+        if out.exists() and (others := set(_names_below(out)) - own):
+            told.append(f"{out} holds files of the old export, the new one, or both; run it again")
+            try:
                 _replace_files(new, out, own, others)
-            else:
-                replace_directory(new, out)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt((_HALF if others else _WHOLE).format(out)) from None
-        except OSError as error:
-            if not others:
-                raise
-            raise StoreError(f"{error.strerror}: {_HALF.format(out)}") from None
+            except OSError as error:
+                raise StoreError(f"{error.strerror}: {told[0]}") from None
+        else:
+            told.append(_whole(out))
+            replace_directory(new, out)
 
 
 @contextmanager
@@ -65,8 +59,25 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
     out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):
         raise _not_an_export(out, "file")
-    with writing(str(out), out.parent), staged(out) as path:
+    with _telling_if_stopped() as told, writing(str(out), out.parent), staged(out) as path:
         yield path
+        told.append(_whole(out))
+
+
+@contextmanager
+def _telling_if_stopped() -> Iterator[list[str]]:
+    """Yield a list for the text that a KeyboardInterrupt then has; before that it has none."""
+    told: list[str] = []
+    try:
+        yield told
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(*told) from None
+
+
+def _whole(out: Path) -> str:
+    """Return in which state an export is while it replaces what is at `out`."""
+    old = "the old one" if out.exists() else "not there"
+    return f"{out} is the new export, whole, or {old}; run it again"
 
 
 def write_index(path: Path, about: dict[str, Any], entries: Sequence[dict[str, Any]]) -> None:

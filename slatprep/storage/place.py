@@ -129,7 +129,8 @@ class Storage:
             return self._sizes()
         except OSError as error:
             where = self.remote or error.filename or self.local
-            raise StoreError(f"{where}: cannot be listed ({error.strerror})") from None
+            what = f"cannot be listed ({error.strerror}); check your permissions"
+            raise StoreError(f"{where}: {what}") from None
 
     def _sizes(self) -> dict[str, int]:
         return local_files(self._path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import pkgutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -374,11 +375,11 @@ def is_store(path: Place) -> bool:
     """
     try:
         _opened_root(path)
-    except UnreachableError:
-        if isinstance(path, Path):
+    except StoreError as error:
+        # A folder that may be entered, but not read, has the same error without such a file.
+        denied = isinstance(error, UnreachableError) and isinstance(path, Path)
+        if denied and os.path.lexists(path / "zarr.json"):
             raise
-        return False
-    except StoreError:
         return False
     return True
 

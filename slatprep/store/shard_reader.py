@@ -69,10 +69,8 @@ class UnreachableError(StoreError):
     """A file of a store that could not be read; the `file` itself may be whole."""
 
     def __init__(self, folder: object, file: str, fault: str) -> None:
-        super().__init__(
-            f"{folder}/{file}: cannot be read ({fault}); check the network and your permissions, "
-            "and run again"
-        )
+        check = "the network and your permissions" if "://" in str(folder) else "your permissions"
+        super().__init__(f"{folder}/{file}: cannot be read ({fault}); check {check}, and run again")
         self.folder, self.file, self.fault = str(folder), file, fault
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:

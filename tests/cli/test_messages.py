@@ -279,10 +279,18 @@ def test_a_store_that_may_not_be_read_is_neither_damaged_nor_another_folder(deni
     (copy / denied).chmod(0)
     script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
     into = ("build-store", *mixed.sides, "--out", copy)
-    for words in (("info", copy), ("verify", copy), *[into] * (denied == "zarr.json")):
+    for words in (("info", copy), ("verify", copy), into):
         told = python("-c", script, *words, code=1).stderr
         assert "(Permission denied)" in told and str(copy / denied) in told
         assert "is not a slatprep store" not in told and "Copy the store again" not in told
+
+
+def test_a_folder_that_may_be_entered_and_not_read_hides_no_store(store, tmp_path):
+    (folder := tmp_path / "home" / "own").mkdir(parents=True)
+    folder.parent.chmod(0o111)
+    script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
+    python("-c", script, "subset", store, "--asset", "cup", "--out", folder / "s.zarr")
+    assert open_store(folder / "s.zarr").ids == ["cup"]
 
 
 def test_a_store_may_be_named_by_the_folder_one_is_in(copy, monkeypatch):

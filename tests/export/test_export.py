@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from slatprep.readers import discover, read_latents
 from slatprep.readers.hdf5 import find_groups
 from slatprep.readers.splits import Shares, split_objects
 from slatprep.records import PROPERTY_COLUMNS
+from slatprep.storage import atomic
 from slatprep.storage.files import file_name
 from slatprep.store import Store, open_store
 
@@ -267,6 +268,33 @@ def test_an_export_stopped_beside_other_files_keeps_the_old_ones_and_is_made_aga
     assert bytes_of(out).keys() == {"mine", "index.json", *new}
     made(out, "g")
     assert bytes_of(out).keys() == {"mine", "index.json", "g"}
+
+
+@pytest.mark.parametrize("format", ["hdf5", "npz"])
+def test_a_stopped_export_says_whether_it_replaced_anything(format, store, tmp_path, monkeypatch):
+    def stopped(**how: Any) -> str:
+        with pytest.raises(KeyboardInterrupt) as raised:
+            export_store(store, tmp_path / "out", format, assets=["cup"], **how)
+        return str(raised.value)
+
+    def flush_and_stop(path: Path, flush: Callable[[Path], None] = atomic.flush) -> None:
+        flush(path)
+        if path == tmp_path:  # It is flushed as soon as the new export is in place.
+            raise KeyboardInterrupt
+
+    assert stopped(progress=Mock(side_effect=KeyboardInterrupt)) == ""
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(atomic, "flush", flush_and_stop)
+    assert stopped().endswith("is the new export, whole, or not there; run it again")
+    assert (tmp_path / "out").exists()
+    assert stopped().endswith("is the new export, whole, or the old one; run it again")
+
+
+def test_a_stop_within_a_publication_names_no_folder_that_is_gone(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(atomic, "flush_tree", Mock(side_effect=KeyboardInterrupt))
+    words = ("--data", "webdataset", "--pictures", 0, "--out", tmp_path / "out")
+    assert "stopped; nothing was replaced" in refused("publish", store, *words, code=130)
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("format", ["hdf5", "usd"])

@@ -341,7 +341,7 @@ def test_a_store_that_may_not_be_read_is_no_other_thing(
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy)
         new_clients()
         told = refused(command, f"s3://{bucket}/s.zarr", code=1).splitlines()[-1]
-    assert told.startswith(f"slatprep: error: s3://{bucket}/s.zarr/zarr.json: may not be read (")
+    assert told.startswith(f"slatprep: error: s3://{bucket}/s.zarr/zarr.json: cannot be read (")
     assert "(None)" not in told
 
 
