@@ -377,8 +377,8 @@ def is_store(path: Place) -> bool:
         _opened_root(path)
     except StoreError as error:
         # A folder that may be entered, but not read, has the same error without such a file.
-        denied = isinstance(error, UnreachableError) and isinstance(path, Path)
-        if denied and os.path.lexists(path / "zarr.json"):
+        there = isinstance(path, Path) and os.path.lexists(path / "zarr.json")
+        if there and isinstance(error, UnreachableError):
             raise
         return False
     return True

@@ -69,8 +69,9 @@ class UnreachableError(StoreError):
     """A file of a store that could not be read; the `file` itself may be whole."""
 
     def __init__(self, folder: object, file: str, fault: str) -> None:
-        check = "the network and your permissions" if "://" in str(folder) else "your permissions"
-        super().__init__(f"{folder}/{file}: cannot be read ({fault}); check {check}, and run again")
+        network = "the network and " if "://" in str(folder) else ""
+        check = f"check {network}your permissions, and run again"
+        super().__init__(f"{folder}/{file}: cannot be read ({fault}); {check}")
         self.folder, self.file, self.fault = str(folder), file, fault
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
