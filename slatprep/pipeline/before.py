@@ -31,6 +31,7 @@ from slatprep.storage.states import is_old, wait_until_old
 from slatprep.store import Store, open_store
 from slatprep.store.reader import is_store
 from slatprep.store.records import BUILD, file_names
+from slatprep.store.shard_reader import UnreachableError
 from slatprep.workers.local import Jobs, run_unordered
 
 SHARE = 0.01
@@ -171,6 +172,8 @@ def look_back(
         return before
     try:
         previous = SourceStore(open_store(place.store))
+    except UnreachableError:
+        raise  # Nothing is aligned anew only because an object store does not answer.
     except StoreError as error:
         return replace(before, damaged=(str(error),) if is_store(place.store) else ())
     seen, state = read_seen(_seen_folder(place), before._bound_to(previous))

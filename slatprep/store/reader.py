@@ -25,7 +25,7 @@ from slatprep.store.assets import ASSET_COLUMNS, AssetTable, AttributesError, nu
 from slatprep.store.attributes import width_findings
 from slatprep.store.contract import MAX_METADATA_BYTES, MAX_VOXELS
 from slatprep.store.layout import FORMAT, FORMAT_VERSION, MERGED_COLUMNS, arrays_with, last_names
-from slatprep.store.shard_reader import DamagedFileError, UnreachableError
+from slatprep.store.shard_reader import DamagedFileError, UnreachableError, is_out_of_reach
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -431,11 +431,11 @@ def _opened_root(path: Place) -> tuple[dict[str, Any], Folder]:
             f"{path} is not a slatprep store: {what} does not exist; build a store with "
             "`slatprep build-store`"
         ) from None
-    except PermissionError as error:
-        raise UnreachableError(path, file.name, str(error.strerror)) from None
     except (OSError, ValueError) as error:
         # A pipe or a folder of that name is no store.
         if isinstance(error, OSError) and error.errno not in (errno.EINVAL, errno.EISDIR):
+            if is_out_of_reach(path, error):
+                raise UnreachableError(path, file.name, str(error.strerror)) from None
             raise StoreError(f"{path}: cannot be reached ({error.strerror})") from None
         document = {}
     attributes = document.get("attributes")

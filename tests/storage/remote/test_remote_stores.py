@@ -329,6 +329,22 @@ def test_a_store_that_cannot_be_listed_is_refused_in_words(url, another, change_
             overview_of(open_store(url))
 
 
+@pytest.mark.parametrize("kind", ["403", "503"])
+def test_a_build_over_a_store_that_does_not_answer_aligns_nothing_anew(
+    url, another, server, monkeypatch, new_clients, kind
+):
+    put(another[1], url)
+    begun: list[str] = []
+    inject(monkeypatch, lambda step, name: step == "asset begun" and begun.append(name))
+    silent = Faults(chance=1.0, kinds=(kind,), lasting=True, only=r"zarr\.json")
+    with faulty(server, silent) as proxy:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", proxy)
+        new_clients()
+        with pytest.raises(StoreError, match=r"zarr\.json: cannot be read .*run again"):
+            build_store(another[0].parameters("pixie"), url)
+    assert begun == []
+
+
 @pytest.mark.parametrize("obstore", ["yes", "no"])
 @pytest.mark.parametrize("command", ["info", "verify", "describe"])
 def test_a_store_that_may_not_be_read_is_no_other_thing(
