@@ -102,7 +102,11 @@ assert "NUMBA_CACHE_DIR" in kernels.WHEN
 
 @pytest.mark.skipif(cpu_count() == 1, reason="one core starts no second process")
 def test_no_process_goes_on_compiling_after_an_interrupt(tmp_path):
-    code = "from slatprep.pipeline.asset import compile_kernels; compile_kernels(print)"
+    # In the background a shell lets processes ignore SIGINT.
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from slatprep.pipeline.asset import compile_kernels; compile_kernels(print)"
+    )
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     words = [sys.executable, "-u", "-c", code]
     with subprocess.Popen(words, stdout=subprocess.PIPE, env=environment) as process:
