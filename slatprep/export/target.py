@@ -12,7 +12,14 @@ from typing import Any
 import orjson
 
 from slatprep.errors import ConfigError, StoreError
-from slatprep.storage.atomic import flush, flush_tree, replace_directory, staged, writing
+from slatprep.storage.atomic import (
+    flush,
+    flush_tree,
+    replace_directory,
+    staged,
+    telling_if_stopped,
+    writing,
+)
 from slatprep.storage.work import scratch_beside
 
 FORMAT = "slatprep-export"
@@ -33,8 +40,8 @@ def directory(out: Path, kind: str) -> Iterator[Path]:
     # A link stays; its target is replaced.
     out = out.resolve()
     # The finished assets of an interrupted build to this path stay.
-    work = scratch_beside(out, "export")
-    with _telling_if_stopped() as told, work as scratch, writing(str(out), out.parent):
+    told, work = list[str](), scratch_beside(out, "export")
+    with telling_if_stopped(told), work as scratch, writing(str(out), out.parent):
         own = _files_of_export(out, kind)
         new = scratch / "export"
         new.mkdir()
@@ -59,19 +66,10 @@ def file(out: Path, is_export: Callable[[Path], bool]) -> Iterator[Path]:
     out = out.resolve()
     if out.exists() and not (out.is_file() and is_export(out)):
         raise _not_an_export(out, "file")
-    with _telling_if_stopped() as told, writing(str(out), out.parent), staged(out) as path:
+    told: list[str] = []
+    with telling_if_stopped(told), writing(str(out), out.parent), staged(out) as path:
         yield path
         told.append(_whole(out))
-
-
-@contextmanager
-def _telling_if_stopped() -> Iterator[list[str]]:
-    """Yield a list for the text that a KeyboardInterrupt then has; before that it has none."""
-    told: list[str] = []
-    try:
-        yield told
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(*told) from None
 
 
 def _whole(out: Path) -> str:

@@ -42,7 +42,7 @@ from slatprep.pipeline.work import spool_of, work_beside
 from slatprep.readers import discover
 from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Normalization, Place
-from slatprep.storage.atomic import staged, writing
+from slatprep.storage.atomic import staged, telling_if_stopped, writing
 from slatprep.storage.place import storage_of
 from slatprep.store.reader import require_outside
 from slatprep.store.record import FailedRecord
@@ -139,7 +139,7 @@ def build_store(
     folder = work_beside(
         place.store, fresh=fresh, keep=keep_work, look=place.look, private_disks=private_disks
     )
-    with place.telling_if_stopped(), folder as work:
+    with telling_if_stopped(place.if_stopped), folder as work:
         pairs = _discover(parameters, jobs, work.shared(), note=note)
         before = look_back(place, pairs, wanted, crew, fresh, rehash, rehash_seed)
         if before.suffices and not keep_work:

@@ -7,8 +7,8 @@ files beside it are made from them. No file of another origin is ever overwritte
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from slatprep.errors import ConfigError, SlatprepError, StoreError, in_unicode
@@ -36,6 +36,7 @@ class Destination:
     `out` is the store as its user names it, and `store` its real place, behind a link. `manifests`
     is the folder of its records, if not beside it. `removed` are those of an existing store's
     assets that the new store lacks, and `ranges` its ranges, if they are known, by words for it.
+    `if_stopped` has what a stop says once the new store is put in place; it is empty before that.
     ConfigError if there is something other than a store, or it lies in another store. StoreError if
     the folder holds files of other origin or the records of another store.
     """
@@ -58,7 +59,7 @@ class Destination:
                 _require_own(folder, path)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
-        self.replacing = False
+        self.if_stopped: list[str] = []
         self.removed: list[str] = []
         self.ranges: dict[str, Normalization] = {}
 
@@ -67,23 +68,12 @@ class Destination:
         if self._remote is not None:
             self._before = published_state(self._remote)
 
-    @contextmanager
-    def telling_if_stopped(self) -> Iterator[None]:
-        """Make a KeyboardInterrupt say that the new store may be in place, if it may be."""
-        try:
-            yield
-        except KeyboardInterrupt:
-            if not self.replacing:
-                raise
-            told = f"{self.out} is the old store or the new one, whole; run it again"
-            raise KeyboardInterrupt(told) from None
-
     def replace(self, new: Path, ids: Iterable[str], staged: Staged | None = None) -> None:
         """Put a finished store with these ids in place; on an object store, do not publish it yet.
 
         `staged` are its files that are on the object store already.
         """
-        self.replacing = True
+        self.if_stopped.append(f"{self.out} is the old store or the new one, whole; run it again")
         self.removed, self.ranges = self.lost(ids, "was")
         if self._before is not None:
             self._upload = upload_store(new, self._before, staged)

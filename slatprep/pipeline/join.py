@@ -29,6 +29,7 @@ from slatprep.pipeline.rows import NextStore, Row, SourceStore, in_order
 from slatprep.pipeline.settle import resolved_contents
 from slatprep.pipeline.work import work_beside
 from slatprep.records import Contents, LatentSpace, Normalization, Place, words_of
+from slatprep.storage.atomic import telling_if_stopped
 from slatprep.storage.documents import read_as
 from slatprep.storage.place import storage_of
 from slatprep.storage.versions import is_version
@@ -190,7 +191,8 @@ def _write(
         if _same_place(source.path, place.store):
             raise ConfigError(f"{place.out} is a store to take assets from; choose another path")
     _require_unclipped(new)
-    with place.telling_if_stopped(), work_beside(place.store, look=place.look) as work:
+    folder = work_beside(place.store, look=place.look)
+    with telling_if_stopped(place.if_stopped), folder as work:
         pack_store(work, place, new, at_most(len(new.rows) // _ROWS_A_JOB, jobs), progress)
         sources = {str(source.path): source.normalization for source in new.stores}
         told = moved_ranges(new.normalization, sources)

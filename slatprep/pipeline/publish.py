@@ -188,7 +188,7 @@ def publish_build(
         normalization=store.normalization,
         removed=len(place.removed),
         taken_out=why_taken_out(place.removed[:PROBLEMS_LISTED], {one.asset_id for one in failed}),
-        unchanged=not place.replacing,
+        unchanged=not place.if_stopped,
         aligned=aligned,
         taken_over=len(store) - aligned,
         warnings=(*warnings, *moved_ranges(store.normalization, place.ranges)),

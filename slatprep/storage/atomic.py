@@ -155,6 +155,15 @@ def staged_apart(path: Path, folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def telling_if_stopped(told: list[str]) -> Iterator[None]:
+    """Make a KeyboardInterrupt say what is in `told` by then: in which state the old may be."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(*told) from None
+
+
+@contextmanager
 def writing(what: str, where: Place) -> Iterator[None]:
     """Turn an OSError of a disk or object store into a StoreError that names what was written."""
     try:
