@@ -30,7 +30,21 @@ from numpy.typing import NDArray
 from slatprep.align.deform import CLEAN, Deformed
 from slatprep.align.figures import measure_figures
 from slatprep.align.finish import as_free, finish, rank_of
-from slatprep.align.ground import GROUND_GAIN, LEAST_ABOVE, RAISED, find_layers, gain, raised, worth
+from slatprep.align.ground import (
+    BETWEEN,
+    GROUND_GAIN,
+    LEAST_ABOVE,
+    LIKELY_GAIN,
+    RAISED,
+    SEARCHED,
+    TRIED,
+    WIDE,
+    WIDTH,
+    find_layers,
+    gain,
+    raised,
+    relative_width,
+)
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE, DISTINCT, MOST_SURVIVORS, POLISH, TIE, Pair
 from slatprep.align.pose import Pose, Similarity
@@ -45,6 +59,7 @@ from slatprep.records import (
     Alignment,
     Engine,
     FitFigures,
+    Ground,
     MaterialField,
     Placement,
     Quality,
@@ -86,6 +101,21 @@ class Candidates(NamedTuple):
     halfway: list[Pose]
 
 
+class Cut(NamedTuple):
+    """What a search finds without a layer, its relative width, and the least rise of the score."""
+
+    ground: Ground
+    pair: Pair
+    candidates: Candidates
+    width: float
+    least: float
+
+    @property
+    def rank(self) -> float:
+        """The score after the search, and the weighted width."""
+        return self.candidates.poses[0].score + WIDTH * self.width
+
+
 def align(
     field: MaterialField, latents: StructuredLatents, parameters: AlignParameters
 ) -> Alignment:
@@ -97,22 +127,41 @@ def align(
 
 def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignment:
     """Return the best alignment without a flat layer if it is clearly better, else `found`."""
+    cuts = [cut for layer in find_layers(pair.pixie) for cut in _cuts(field, pair, found, layer)]
     best, most = found, -np.inf
-    for ground in (raised(layer, by) for layer in find_layers(pair.pixie) for by in RAISED):
+    for cut in sorted(cuts, key=lambda cut: -cut.rank)[:TRIED]:
+        without = replace(_alignment(cut.pair, cut.candidates), ground=cut.ground)
+        rise = gain(without, found)
+        rank = rise + WIDTH * cut.width
+        # A placement that leads after the search may score less once it is finished.
+        if without.score >= found.score and rise > cut.least and rank > most:
+            best, most = without, rank
+    return best
+
+
+def _cuts(field: MaterialField, pair: Pair, found: Alignment, layer: Ground) -> list[Cut]:
+    """Search without a layer, cut off at several heights; leave out what cannot be better."""
+    own, searched, cuts = Pose(Similarity.of(found.transform)), [], []
+    for by in (*RAISED, *BETWEEN):
+        ground = raised(layer, by)
         solid = above(field.occupancy, ground)
         if np.count_nonzero(solid) < LEAST_ABOVE * np.count_nonzero(field.occupancy):
             continue
         there = Pair(pair.slat, surface_of(solid), pair.parameters)
-        candidates = _search(there)
-        if candidates.poses[0].score < found.score:
+        if by in RAISED:
+            candidates = _search(there)
+            searched.append(candidates)
+        elif searched:
+            poses = [pose for one in searched for pose in (*one.poses, *one.wide)]
+            candidates = searched[-1]._replace(poses=there.polish(poses))
+        else:
             continue
-        without = replace(_alignment(there, candidates), ground=ground)
-        # A placement that leads after the search may score less once it is finished.
-        if without.score >= found.score and (rise := gain(without, found)) > GROUND_GAIN:
-            rank = worth(rise, ground, field.occupancy, solid)
-            if rank > most:
-                best, most = without, rank
-    return best
+        width = relative_width(ground, field.occupancy, solid)
+        another = pair.apart(candidates.poses[:1], own)[0] >= 2.0 * DISTINCT
+        least = LIKELY_GAIN if another and width == WIDE else GROUND_GAIN
+        if candidates.poses[0].score >= found.score + least - SEARCHED:
+            cuts.append(Cut(ground, there, candidates, width, least))
+    return cuts
 
 
 def _search(pair: Pair) -> Candidates:

@@ -40,15 +40,24 @@ LEAST_FACE = 0.04
 LEAST_ABOVE = 0.05
 """Smallest share of the voxels above ground; less is the lid of a board, not an object."""
 
-RAISED = (0.0, 1.0, 2.0)
-"""Heights of the cut above a layer's top, in voxels: ground is rough, and objects stand in it."""
+RAISED, BETWEEN = (0.0, 1.0), (0.5, 1.5, 2.0)
+"""Heights of the cut above a layer's top, in voxels: ground is rough, and objects stand in it. At
+the latter ones the placements that the former ones found are refined."""
 
-GROUND_GAIN = 0.05
-"""Rise of the score without a layer above which the layer is ground."""
+TRIED = 2
+"""Number of cuts without which placements are finished: those that score best after the search."""
+
+GROUND_GAIN, LIKELY_GAIN = 0.05, -0.01
+"""Rise of the score without a layer above which the layer is ground. The second one holds for a
+layer of width `WIDE` without which another placement fits best: that of a plate, say, no longer in
+its ground but on it."""
 
 WIDTH, WIDE = 0.3, 1.2
 """Weight of a layer's width, over that of what stands on it, beside the rise of the score, and the
-ratio above which it adds no more. Ground is seldom the narrower one."""
+largest such ratio: wider ones count as this. Ground is seldom the narrower one."""
+
+SEARCHED = 0.01
+"""How much more the score may rise once a placement is finished than it did after the search."""
 
 
 def find_layers(surface: Surface) -> list[Ground]:
@@ -95,15 +104,13 @@ def gain(without: Alignment, found: Alignment) -> float:
     return max(rise, 0.5 * (slat + pixie))
 
 
-def worth(
-    rise: float, layer: Ground, occupancy: NDArray[np.bool_], solid: NDArray[np.bool_]
-) -> float:
-    """Return the rank of a layer: the rise of the score without it, and its weighted width.
+def relative_width(layer: Ground, occupancy: NDArray[np.bool_], solid: NDArray[np.bool_]) -> float:
+    """Return a layer's width over that of what stands on it, `WIDE` at most.
 
     The layer is what `occupancy` has and `solid` lacks.
     """
     left_out, standing = (_width(voxels, layer.normal) for voxels in (occupancy & ~solid, solid))
-    return rise + WIDTH * min(left_out / max(standing, 1.0), WIDE)
+    return min(left_out / max(standing, 1.0), WIDE)
 
 
 def _width(voxels: NDArray[np.bool_], normal: Array) -> float:

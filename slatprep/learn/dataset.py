@@ -310,6 +310,9 @@ class SlatLoader(DataLoader[SparseBatch]):
     def set_epoch(self, epoch: int, batches: int = 0) -> None:
         """Set the epoch of the next pass, which decides order and augmentation.
 
-        The pass skips its first `batches`. Without a call, each pass is the next epoch.
+        The pass skips its first `batches`. Without a call, each pass is the next epoch. ConfigError
+        if `batches` is negative.
         """
+        if batches < 0:
+            raise ConfigError(f"batches to skip: {batches}; expected 0 or more")
         self.order.epoch, self.order.first = epoch, batches * (self.batch_size or 1)

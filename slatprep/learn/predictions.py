@@ -23,6 +23,7 @@ from slatprep.normalize import change_ranges
 from slatprep.readers.files import ArraySpec, load_source, npz_arrays, refusing, zarr_array
 from slatprep.readers.hdf5 import group_arrays, group_name
 from slatprep.readers.pixieverse import UNLABELLED
+from slatprep.readers.ranges import largest_bound
 from slatprep.readers.slat import check_coords
 from slatprep.readers.splits import HASH, Shares
 from slatprep.records import (
@@ -221,6 +222,7 @@ def check_prediction(
     converted = ranges is not None and ranges.ranges != columns
     if ranges is not None and converted:
         properties = change_ranges(properties, ranges, normalization)
+        require_normalised(source, properties[used])
     material = given.classes(used, contents.n_classes)
     material = None if material is None else material[order]
     return VoxelPrediction(properties[order], material, converted)
@@ -265,7 +267,7 @@ class GivenPrediction:
         """Return which voxels (N,) are predicted, by default all."""
         if "valid" not in self.arrays:
             return np.ones(count, dtype=bool)
-        return self._shaped("valid", (count,)).astype(bool)
+        return _whole(self.source, "valid", self._shaped("valid", (count,)), 2).astype(bool)
 
     def finite(self, name: str, used: NDArray[np.bool_], columns: int) -> NDArray[np.float64]:
         """Return properties (N, P), finite in the used rows (N,)."""
@@ -293,9 +295,11 @@ class GivenPrediction:
         if "ranges" not in self.arrays:
             return None
         spans = self._shaped("ranges", (len(table), 2)).astype(np.float64)
-        if not (np.isfinite(spans).all() and (spans[:, 0] < spans[:, 1]).all()):
+        most = np.array([largest_bound(one) for one in table])[:, None]
+        if not ((np.abs(spans) <= most).all() and (spans[:, 0] < spans[:, 1]).all()):
             what = f"ranges are {spans.tolist()}"
-            raise InputError(self.source, what, "lo below hi, a row a property")
+            expected = f"lo below hi, a row a property, within {most.ravel().tolist()}"
+            raise InputError(self.source, what, expected)
         pairs = zip(table, spans.tolist(), strict=True)
         return Normalization(tuple(replace(one, lo=lo, hi=hi) for one, (lo, hi) in pairs), "file")
 

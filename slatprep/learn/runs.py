@@ -20,13 +20,14 @@ from typing import Any
 
 import torch
 
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, InputError
 from slatprep.learn.predictions import RUN_BYTES, RUN_FILE, SPLITS_FILE
 from slatprep.readers.files import refusing
 from slatprep.readers.splits import Assignment
 from slatprep.records import INK, MUTED
 from slatprep.storage.atomic import staged, take_lock
 from slatprep.storage.documents import read_document
+from slatprep.storage.files import file_digest
 from slatprep.storage.place import storage_of
 
 LAST, BEST = "last.pt", "best.pt"
@@ -178,13 +179,27 @@ class Run:
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; an existing one is replaced when the new one is complete."""
         buffer = BytesIO()
-        torch.save(state, buffer)  # On a full disk torch.save raises no OSError.
+        torch.save(
+            state | {"run": self._digest}, buffer
+        )  # On a full disk torch.save raises no OSError.
         with staged(self.path / name) as path:
             path.write_bytes(buffer.getbuffer())
 
     def load(self, name: str) -> dict[str, Any] | None:
-        """Read a checkpoint, None if there is none; InputError if the file is damaged."""
-        return read_state(self.path / name) if (self.path / name).exists() else None
+        """Read a checkpoint, None if there is none.
+
+        InputError if the file is damaged, or of a run with other parameters.
+        """
+        if not (path := self.path / name).exists():
+            return None
+        state = read_state(path)
+        if state.get("run") != self._digest:
+            raise InputError(path, "is of another run", f"a checkpoint of {self.path / RUN_FILE}")
+        return state
+
+    @property
+    def _digest(self) -> str:
+        return file_digest(self.path / RUN_FILE)
 
     def log(self, history: Sequence[EpochRecord]) -> None:
         """Write ``log.csv``, and events for TensorBoard if it is installed."""

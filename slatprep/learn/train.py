@@ -213,6 +213,7 @@ def train(
                 references[one.name] = float(_over_objects(val_set, errors))
             run.draw(session.history, references)
         predictions = run.path / PREDICTIONS
+        run.load(BEST)
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     diverged_in = session.epoch - 1 if session.diverged() else None
     return TrainSummary(session.history, session.best_epoch, references, predictions, diverged_in)

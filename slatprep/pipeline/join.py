@@ -204,7 +204,7 @@ def _require_unclipped(new: NextStore) -> None:
     clipped = (new.column("clipped") + new.column("clipped_grid")).any(axis=1)
     for row, lost in zip(new.rows, clipped, strict=True):
         source = new.stores[row.store]
-        if lost and source.normalization != new.normalization:
+        if lost and source.normalization.ranges != new.normalization.ranges:
             raise StoreError(
                 f"{source.path}: values of {row.asset_id} were clipped to its ranges, "
                 "so it cannot be brought to others; build it again"
@@ -282,8 +282,8 @@ def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:
 def _common_ranges(sources: Sequence[SourceStore]) -> Normalization:
     """Return the ranges that all stores have, or ranges that span those of all datasets."""
     ranges = [source.normalization for source in sources]
-    if all(one == ranges[0] for one in ranges):
-        return ranges[0]
+    if all(one.ranges == ranges[0].ranges for one in ranges):
+        return next((one for one in ranges if one.source != "dataset"), ranges[0])
     for source, one in zip(sources, ranges, strict=True):
         if one.source != "dataset":
             raise ConfigError(
@@ -306,7 +306,13 @@ def _bounds(source: SourceStore) -> NDArray[np.float64]:
 
 def _in_words(space: LatentSpace) -> str:
     grid = f"{space.channels} channels, {space.resolution}^3 voxels"
-    return f"{space.encoder!r} ({grid}, standardised: {space.standardised})"
+    by = f" by mean {space.mean} and std {space.std}" if space.standardised and space.mean else ""
+    return f"{space.encoder!r} ({grid}, standardised: {space.standardised}{by})"
+
+
+def _on_one_scale(space: LatentSpace) -> LatentSpace:
+    """Return what latents must share to be joined; raw ones need no mean and std."""
+    return space if space.standardised else replace(space, mean=(), std=())
 
 
 def _common_contents(sources: Sequence[SourceStore], rows: Sequence[Row]) -> Contents:
@@ -320,7 +326,7 @@ def _common_contents(sources: Sequence[SourceStore], rows: Sequence[Row]) -> Con
                     f"{source.path} has other {name} than {sources[0].path}; "
                     "expected the same tables in both"
                 )
-        if replace(other.latents, mean=(), std=()) != replace(first.latents, mean=(), std=()):
+        if _on_one_scale(other.latents) != _on_one_scale(first.latents):
             raise ConfigError(
                 f"{source.path} has latents of {_in_words(other.latents)}, "
                 f"{sources[0].path} of {_in_words(first.latents)}; expected the same"

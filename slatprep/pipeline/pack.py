@@ -259,12 +259,12 @@ def _renormaliser(
 ) -> Callable[[NDArray[Any], str], NDArray[Any]]:
     """Return a function that converts rows of an array, by its name, to other ranges."""
     before, after = ([span.hi - span.lo for span in ranges.ranges] for ranges in (old, new))
-    scale = np.divide(before, after)
+    scale, same = np.divide(before, after), old.ranges == new.ranges
 
     def change(values: NDArray[Any], name: str) -> NDArray[Any]:
-        if old != new and name == "voxel/spread":
+        if not same and name == "voxel/spread":
             return (values * scale).astype(np.float32)
-        if old == new or not name.endswith("/properties"):
+        if same or not name.endswith("/properties"):
             return values
         last = np.moveaxis(values, 1, -1)  # (N, P), or of a grid (1, x, y, z, P)
         changed = normalize_properties(denormalize_properties(last, old), new)
@@ -290,7 +290,7 @@ def _runs(path: Path, group: str, new: NextStore) -> Runs:
 
 def _packs_alike(path: Path, group: str, new: NextStore, source: SourceStore) -> bool:
     """Return whether a store has a group's values like the new one, in chunks packed alike."""
-    if group != "record" and source.normalization != new.normalization:
+    if group != "record" and source.normalization.ranges != new.normalization.ranges:
         return False
     held = (name for name in arrays_in(group, new.merged) if source.holds(name))
     return all(packing_of(path / name) == packing_of(source.path / name) for name in held)

@@ -303,7 +303,8 @@ class NextStore:
         because ranges come from the dataset.
         """
         values = column("property_ambiguity", self.rows, self.stores)
-        other = [source.normalization != self.normalization for source in self.stores]
+        ranges = self.normalization.ranges
+        other = [source.normalization.ranges != ranges for source in self.stores]
         mapped = [k for k, row in enumerate(self.rows) if row.spooled or other[row.store]]
         for k in mapped:
             if not (row := self.rows[k]).spooled:

@@ -11,7 +11,14 @@ import numpy as np
 
 from slatprep.errors import ConfigError
 from slatprep.normalize import PIXIE_RANGES, normalization_of
-from slatprep.records import PROPERTIES, PROPERTY_COLUMNS, Normalization, Place, Property
+from slatprep.records import (
+    PROPERTIES,
+    PROPERTY_COLUMNS,
+    Normalization,
+    Place,
+    Property,
+    PropertyRange,
+)
 from slatprep.storage.documents import read_bounded, unique
 
 _MAX_BYTES = 2**20
@@ -50,18 +57,23 @@ def read_ranges(path: Place, properties: Sequence[Property] = PROPERTIES) -> Nor
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot read ranges ({error})") from error
     ranges = []
-    for name, log10 in ((one.name, one.log10) for one in properties):
+    for one in properties:
+        name, most = one.name, largest_bound(one)
         entry = table.get(name) if isinstance(table, dict) else None
         lo, hi = (entry.get(k) if isinstance(entry, dict) else None for k in ("lo", "hi"))
-        most = _MAX_LOG10 if log10 else _MAX_BOUND
         if not _is_number(lo, most) or not _is_number(hi, most) or lo >= hi:
-            mapped = ", in log10 of the SI value" if log10 else ""
+            mapped = ", in log10 of the SI value" if one.log10 else ""
             raise ConfigError(
                 f"{path}: {name} has lo = {lo!r} and hi = {hi!r}; expected a table [{name}] with "
                 f"lo < hi between {-most:,.0f} and {most:,.0f}{mapped}"
             )
         ranges.append((float(lo), float(hi)))
     return normalization_of(np.array(ranges), path.name, properties)
+
+
+def largest_bound(one: Property | PropertyRange) -> float:
+    """Return the largest magnitude that the bounds of a property may have, in mapped units."""
+    return _MAX_LOG10 if one.log10 else _MAX_BOUND
 
 
 def pixie_ranges(table: Sequence[Property]) -> Normalization:

@@ -12,7 +12,7 @@ from support.shapes import GRID, chair, field_of, judged, surface_latents
 from slatprep import records
 from slatprep.align import align
 from slatprep.align import field as engine
-from slatprep.align.ground import find_layers, gain, worth
+from slatprep.align.ground import find_layers, gain, relative_width
 from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import Pair
 from slatprep.align.pose import Similarity
@@ -90,7 +90,7 @@ def test_the_lid_of_a_low_object_is_not_taken_for_its_ground(radius):
 
 
 @pytest.mark.parametrize(("thick", "sunk", "below", "radius", "within"), [
-    (3, 1, 1, np.inf, 0.5), (3, 2, 1, 25, 1.5), (4, 2, 2, np.inf, 1.2), (6, 2, 2, np.inf, 1.5),
+    (3, 1, 1, np.inf, 0.5), (3, 2, 1, 25, 1.5), (4, 2, 2, np.inf, 1.2), (6, 2, 2, np.inf, 1.6),
 ])  # fmt: skip
 def test_a_rug_that_lies_in_the_ground_is_placed(thick, sunk, below, radius, within):
     """What is cut off with the ground is drawn down again, or the rug would be half as thick."""
@@ -117,16 +117,16 @@ def test_a_layer_counts_by_its_width_over_that_of_what_stands_on_it():
     hoop = (abs(away - 12) < 0.5) & (abs(GRID[..., 2] - 11) < 2)
     pillar, wide = (away < 12) & (GRID[..., 2] >= 13), (away < 30) & (abs(GRID[..., 2] - 11) < 2)
     up, down = (records.Ground(np.array([0.0, 0.0, way]), 0.0) for way in (1.0, -1.0))
-    assert worth(0.1, up, hoop | pillar, pillar) == pytest.approx(0.1 + 0.3 / 0.95**0.5, abs=0.02)
-    assert worth(0.1, up, wide | pillar, pillar) == pytest.approx(0.1 + 0.3 * 1.2), "at most"
-    assert worth(0.1, down, wide | pillar, wide) == pytest.approx(0.1 + 0.3 * 12 / 30, abs=0.01)
-    assert worth(0.1, up, pillar, pillar) == pytest.approx(0.1), "nothing is left out"
+    assert relative_width(up, hoop | pillar, pillar) == pytest.approx(0.95**-0.5, abs=0.05)
+    assert relative_width(up, wide | pillar, pillar) == 1.2, "at most"
+    assert relative_width(down, wide | pillar, wide) == pytest.approx(12 / 30, abs=0.03)
+    assert relative_width(up, pillar, pillar) == 0.0, "nothing is left out"
 
 
 @pytest.mark.parametrize("by_width", [True, False])
 def test_of_two_layers_that_may_be_ground_the_wider_one_is(by_width, monkeypatch):
     """A table with a rough lid on a larger mat: upside down, the mat is the smoother lid."""
-    monkeypatch.setattr("slatprep.align.ground.WIDTH", 0.3 * by_width)
+    monkeypatch.setattr(engine, "WIDTH", 0.3 * by_width)
     x, y, z = np.moveaxis(GRID - 31.5, -1, 0)
     lid = (abs(x) < 15) & (abs(y) < 13) & (z > -3) & (z < 0)
     table = lid | ((abs(x) < 2) & (abs(y) < 2) & (z > -12) & (z < 0))
@@ -168,10 +168,14 @@ def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch):
     assert align(field_of(chair()), surface_latents(chair()), DEFAULT).ground is None
 
 
-@pytest.mark.parametrize(("rise", "taken"), [(0.049, False), (0.051, True)])
-def test_ground_is_what_the_object_fits_clearly_better_without(rise, taken, monkeypatch):
+@pytest.mark.parametrize(("radius", "rise", "taken"), [
+    (20, 0.049, False), (20, 0.051, True), (np.inf, -0.011, False), (np.inf, -0.009, True),
+])  # fmt: skip
+def test_ground_is_what_the_object_fits_clearly_better_without(radius, rise, taken, monkeypatch):
+    """About as well is enough without a layer far wider than it, in which it lay elsewhere."""
     monkeypatch.setattr(engine, "gain", lambda without, found: rise)
-    found = align(field_of(chair() | slab(3.0)), surface_latents(chair()), DEFAULT)
+    ground = slab(3.0, radius=radius)
+    found = align(field_of(chair() | ground), surface_latents(larger(chair(), 1.2)), DEFAULT)
     assert (found.ground is not None) == taken
 
 

@@ -179,6 +179,8 @@ def test_each_pass_of_a_loader_is_the_next_epoch(learn_store):
     passes += [[batch.coords for batch in loader]]
     for own, expected in zip(passes, known, strict=True):
         assert all(map(torch.equal, own, expected)) and len(own) == len(loader)
+    with pytest.raises(ConfigError, match="batches to skip: -1"):
+        loader.set_epoch(5, -1)
 
 
 @pytest.mark.parametrize(("name", "value", "expected"), [

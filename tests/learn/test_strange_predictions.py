@@ -76,6 +76,8 @@ def test_nothing_is_read_or_written_outside(learn_copy, tmp_path):
     ("coords", 1.5, "has coordinate 1.5"),
     ("coords", 1, "occurs twice"),
     ("valid", False, "row 0 is not valid"),
+    ("valid", 0.5, "has valid 0.5"),
+    ("valid", np.nan, "has valid nan"),
     ("resolution", np.array(32), r"has a grid of 32\^3; expected 64\^3"),
     ("E", np.zeros(3), "expected properties"),
 ])  # fmt: skip

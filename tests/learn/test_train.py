@@ -168,6 +168,12 @@ def test_wrong_runs_are_named(learn_store, tmp_path):
     train(learn_store, out, one)
     with pytest.raises(ConfigError, match=r"other parameters \(seed 1 instead of 2\)"):
         train(learn_store, out, dataclasses.replace(one, seed=2))
+    for name in (LAST, BEST):
+        train(learn_store, tmp_path / name, dataclasses.replace(one, seed=2))
+        shutil.copytree(out, tmp_path / f"{name} of another")
+        shutil.copy(tmp_path / name / name, tmp_path / f"{name} of another")
+        with pytest.raises(InputError, match=f"{name}: is of another run"):
+            train(learn_store, tmp_path / f"{name} of another", one)
     (out / LAST).write_bytes(b"not a checkpoint")
     said: list[str] = []
     with pytest.raises(InputError, match=r"last\.pt"):

@@ -188,6 +188,40 @@ def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):
     assert not out.exists()
 
 
+def test_latents_that_were_standardised_by_other_moments_are_not_joined(folder, tmp_path):
+    """Raw ones are, and their moments are pooled."""
+    stores = [copied(folder / f"{name}.zarr", tmp_path / f"{name}.zarr") for name in ("ac", "bd")]
+    for standardised in (False, True):
+        for path, mean in zip(stores, (1.0, 2.0), strict=True):
+            latents = open_store(path).attributes["latents"]
+            of = {"mean": [mean] * 8, "std": [3.0] * 8, "standardised": standardised}
+            edit_attributes(path, latents=latents | of)
+        if standardised:
+            with pytest.raises(ConfigError, match=r"standardised: True by mean \(2\.0, .*the same"):
+                concat_stores(stores, tmp_path / "out.zarr")
+        else:
+            concat_stores(stores, tmp_path / "raw.zarr")
+    pooled = open_store(tmp_path / "raw.zarr").contents.latents
+    feats = np.concatenate([asset.feats for asset in open_store(tmp_path / "raw.zarr")])
+    np.testing.assert_allclose(pooled.mean, feats.mean(axis=0, dtype=np.float64), atol=1e-5)
+
+
+def test_equal_ranges_of_files_with_other_names_are_joined(make_dataset, tmp_path):
+    for name in ("a", "b"):
+        file = tmp_path / f"ranges of {name}.toml"
+        spans = {"youngs_modulus": (3, 11), "density": (1, 4), "poissons_ratio": (0.1, 0.5)}
+        file.write_text("".join(f"[{k}]\nlo = {lo}\nhi = {hi}\n" for k, (lo, hi) in spans.items()))
+        build_store(
+            Dataset(tmp_path / name).having(name).parameters(str(file)), tmp_path / f"{name}.zarr"
+        )
+    concat_stores([tmp_path / "a.zarr", tmp_path / "b.zarr"], tmp_path / "ab.zarr")
+    joined = open_store(tmp_path / "ab.zarr")
+    assert joined.normalization.source == "ranges of a.toml"
+    for name in ("a", "b"):
+        own = open_store(tmp_path / f"{name}.zarr")[name]
+        np.testing.assert_array_equal(joined[name].properties, own.properties)
+
+
 def test_a_source_is_never_replaced_whatever_path_leads_there(folder, tmp_path, monkeypatch):
     shutil.copytree(folder / "ac.zarr", tmp_path / "own.zarr")
     before = tree(tmp_path / "own.zarr")
