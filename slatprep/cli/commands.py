@@ -144,6 +144,12 @@ class LazyGroup(click.Group):
                 advice = "give a shorter name"
             say(f"slatprep: error: {place}: {error.strerror}; {advice}", err=True)
             ctx.exit(output.EXIT_INCOMPLETE)
+        except MemoryError:
+            say(
+                "slatprep: error: memory ran out; run where more is free, or with fewer --jobs",
+                err=True,
+            )
+            ctx.exit(output.EXIT_INCOMPLETE)
         except KeyboardInterrupt as stop:
             told = str(stop) or getattr(ctx.obj, "if_stopped", output.NOTHING_REPLACED)
             say(f"\nslatprep: stopped; {told}", err=True)

@@ -103,7 +103,7 @@ def process_several(
         for one in pair.annotations
         if one.sample in faults
     }
-    told |= {one.pair.sample: _contribution(one, one in good, sources) for one in annotated}
+    told |= {one.pair.sample: _contribution(one, first, one in good, sources) for one in annotated}
     contributions = tuple(told[one.sample] for one in pair.annotations)
     return replace(
         first,
@@ -195,8 +195,11 @@ def _same_alignment(field: MaterialField, annotated: list[Finished]) -> Alignmen
     return None
 
 
-def _contribution(one: Finished, is_good: bool, sources: tuple[SourceFile, ...]) -> Contribution:
-    """Return the contribution of an annotation that can be used."""
+def _contribution(
+    one: Finished, first: Finished, is_good: bool, sources: tuple[SourceFile, ...]
+) -> Contribution:
+    """Return the contribution of an annotation that can be used; `first` is the record's."""
     left_out = "" if is_good else f"its alignment failed: {one.judgement.reasons[0]}"
     files = tuple(k for k, file in enumerate(sources) if file in one.field.sources)
-    return Contribution(one.pair.sample, files, left_out, one.alignment, one.judgement)
+    alignment = None if one.alignment is first.alignment else one.alignment
+    return Contribution(one.pair.sample, files, left_out, alignment, one.judgement)

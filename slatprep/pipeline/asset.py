@@ -70,7 +70,7 @@ def process_asset(
     judgement are taken over. InputError if a source cannot be used or a partner is missing.
     """
     if pair.others:
-        return process_several(pair, parameters, known.merged if known else ())
+        return process_several(pair, parameters, known.contributions if known else ())
     field = read_field(pair, parameters.sample.max_unphysical)
     latents = read_latents(pair)
     reached("asset read", pair.asset_id)
@@ -97,7 +97,8 @@ def finish_asset(
         record = record_of(asset, context.recipe, key)
         if faults := faults_of(record):
             what = f"what was found is more than a record may hold ({'; '.join(faults[:3])})"
-            raise InputError(f"asset {pair.asset_id!r}", what, "sources of a usual kind")
+            expected = "fewer annotations" if pair.others else "sources of a usual kind"
+            raise InputError(f"asset {pair.asset_id!r}", what, expected)
     except Exception as error:
         # A fault in one asset, even of slatprep's own, must not cost the others.
         if context.strict:

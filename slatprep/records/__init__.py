@@ -131,9 +131,9 @@ class Contribution:
     left_out: str = ""
     """Why it is not merged; empty if it is."""
     alignment: Alignment | None = None
-    """The alignment of its own frame; null if it could not be read."""
+    """The alignment of its own frame; null if that is the record's, or if it could not be read."""
     judgement: Judgement | None = None
-    """The judgement of that alignment."""
+    """The judgement of its alignment; null if it could not be read."""
 
 
 @dataclass(frozen=True)

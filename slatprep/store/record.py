@@ -153,6 +153,14 @@ class AssetRecord:
     warnings: Annotated[tuple[str, ...], MaxLen(MAX_WARNINGS)]
     """Remarks about the sources that a person should know."""
 
+    @property
+    def contributions(self) -> tuple[Contribution, ...]:
+        """``merged`` with the record's alignment wherever an annotation has that one."""
+        return tuple(
+            replace(one, alignment=self.alignment) if one.judgement and not one.alignment else one
+            for one in self.merged
+        )
+
     def of_first_pass(self) -> AssetRecord:
         """Return the record as it was before the passes over the whole dataset."""
         if (first := self.first_pass) is None:

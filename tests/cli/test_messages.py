@@ -342,6 +342,16 @@ def test_a_full_disk_is_a_line(store, tmp_path, monkeypatch, words):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_memory_that_ran_out_is_a_line(store, tmp_path, monkeypatch):
+    def no_memory(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(atomic, "flush", no_memory)
+    line = refused("report", store, "--out", tmp_path / "result.html", code=1)
+    assert line == "slatprep: error: memory ran out; run where more is free, or with fewer --jobs\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_takes_nothing_is_a_line(store):
     pytest.importorskip("torch")
     train = ("train", store, "--out", NOWHERE, "--epochs", 1, "--size", "small")

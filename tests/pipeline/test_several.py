@@ -14,6 +14,7 @@ from support.faults import inject
 from support.synthetic import Dataset, make_asset
 from support.trees import copied, records_of, tree
 
+from slatprep.demo import make_demo
 from slatprep.errors import ConfigError, StoreError
 from slatprep.export import export_store
 from slatprep.inspect.check import check_alignment
@@ -25,6 +26,7 @@ from slatprep.pipeline.dataset import BuildSummary, build_store, plan_build
 from slatprep.pipeline.join import concat_stores, subset_store
 from slatprep.records import SourceRoots, Units
 from slatprep.store import open_store
+from slatprep.store.records import StoredRecords
 
 FACTORS = (1.0, 3.0, 0.7)
 """What the samples of object ``a`` make of Young's modulus."""
@@ -170,16 +172,32 @@ def test_the_record_has_every_annotation_with_its_files_and_its_source(merged):
     entries = records["a"]["merged"]
     for entry in entries:
         assert entry["judgement"]["verdict"] == "good"
-        assert entry["alignment"]["transform"] == entries[0]["alignment"]["transform"]
+        assert entry["alignment"] is None, "it is the record's"
         assert not entry["left_out"]
     first, second, _ = records["b"]["merged"]
-    assert first["alignment"]["transform"] != second["alignment"]["transform"]
+    assert first["alignment"] is None
+    assert second["alignment"]["transform"] != records["b"]["alignment"]["transform"]
     assert "merged" not in records["c"]
     assert all("source" not in file for file in records["c"]["sources"])
     assert records["a"]["judgement"]["verdict"] == "doubtful"
     assert "its annotations differ" in records["a"]["judgement"]["reasons"][0]
     said = "sample also_1 has no youngs_modulus, poissons_ratio, classes"
     assert said in records["b"]["warnings"]
+
+
+def test_bent_objects_have_their_one_alignment_once_in_the_record(tmp_path):
+    """Five times the numbers of its deformation would be more than a record may hold."""
+    folder = tmp_path / "demo"
+    make_demo(folder, assets=1, seed=7, samples=5, levels=(5,))
+    parameters = load_parameters(folder / "dataset.toml")
+    source = replace(parameters.pixieverse, plausibility="warn")
+    summary = build_store(replace(parameters, pixieverse=source), tmp_path / "s.zarr")
+    store = open_store(summary.store)
+    record = StoredRecords(store).of(store.ids[0])
+    assert record.alignment.deformation is not None
+    assert [one.alignment for one in record.merged] == [None] * 5
+    assert all(one.alignment is record.alignment for one in record.contributions)
+    assert verify_store(summary.store, sources=True).findings == ()
 
 
 def test_a_store_of_merged_labels_is_sound(merged):

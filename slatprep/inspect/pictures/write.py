@@ -71,8 +71,11 @@ def write_pictures(
         cells[asset_id] = cell
     if not on_sheet:
         return list(files.values()), None
-    _write(target / SHEET, _sheet([cell for one in checks if (cell := cells[one.asset_id])]))
-    return list(files.values()), target / SHEET
+    sheet = target / SHEET
+    while sheet in files.values():
+        sheet = sheet.with_name(f"_{sheet.name}")
+    _write(sheet, _sheet([cell for one in checks if (cell := cells[one.asset_id])]))
+    return list(files.values()), sheet
 
 
 def sheet_of(store: Store, asset_ids: Sequence[str]) -> bytes:

@@ -232,7 +232,7 @@ def merged_findings(
     """Yield findings where merged labels differ from a new merge by sources and alignments."""
     latents, contents = asset.latents, asset.store.contents
     parts = []
-    for one in record.merged:
+    for one in record.contributions:
         if one.left_out or one.alignment is None or one.judgement is None:
             continue
         try:

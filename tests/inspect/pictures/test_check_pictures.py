@@ -313,6 +313,16 @@ def test_an_id_becomes_a_safe_file_name(copy, tmp_path):
     assert file.parent == tmp_path / "safe" and file.exists() and sheet is None
 
 
+@pytest.mark.usefixtures("sides")
+def test_an_asset_called_sheet_keeps_its_picture(copy, tmp_path):
+    rewrite(copy, "asset/id", 0, "sheet")
+    store = open_store(copy)
+    checks = [check_alignment(store, row) for row in (0, 1)]
+    files, sheet = write_pictures(store, checks, tmp_path / "drawn")
+    assert sheet is not None and {*files, sheet} == {*(tmp_path / "drawn").iterdir()}
+    assert len({*files, sheet}) == 3
+
+
 # -- the terminal ---------------------------------------------------------------
 
 

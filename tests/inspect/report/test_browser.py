@@ -244,7 +244,7 @@ def test_it_opens_an_asset_that_turns(opened):
     canvas.send_keys(Keys.ARROW_RIGHT * 4)
     wait_until(lambda: pixels() != front)
     still = pixels()
-    click(opened, "[data-mode=youngs_modulus]")
+    click(opened, "[data-mode='property.youngs_modulus']")
     wait_until(lambda: pixels() != still)
     assert "Pa" in opened.find_element("id", "scale").text
     click(opened, "[data-switch=turning]")
@@ -455,7 +455,7 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Report:
     root = tmp_path_factory.mktemp("texts") / IN_NAMES
     dataset = Dataset(root)
     (root / "voxels").mkdir(parents=True)
-    units = {"damping": HOSTILE, "friction": f"{HOSTILE}\u2028\n", "heat": "\\u003cscript>"}
+    units = {"slat": HOSTILE, "friction": f"{HOSTILE}\u2028\n", "distance": "\\u003cscript>"}
     for number, name in enumerate((*SOUND, *REFUSED, "torn")):
         dataset.add(name, number)
         asset = dataset.assets[name]
@@ -479,6 +479,30 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> Report:
     assert summary.statuses["ok"] == len(SOUND)
     assert verify_store(root / f"{IN_NAMES}.zarr", sources=True).findings == ()
     return page_of(summary, root / f"{IN_NAMES}.html")
+
+
+def test_a_property_may_have_the_name_of_anything_else_that_is_shown(browser, strange):
+    open_page(browser, strange, "#asset=0")
+    drawn(browser)
+    lengths = browser.execute_async_script(
+        "const keys = ['slat', 'property.slat', 'distance', 'property.distance'];"
+        "const done = arguments[0];"
+        "Data.voxels(0).then((of) => done(keys.map((key) => of[key].length)))"
+    )
+    assert lengths[0] == 3 * lengths[1] > 0 and lengths[1:] == [lengths[1]] * 3
+    click(browser, "[data-mode='property.distance']")
+    pressed = browser.find_elements("css selector", "[data-mode][aria-pressed=true]")
+    assert [one.get_attribute("data-mode") for one in pressed] == ["property.distance"]
+    assert "voxel" not in browser.find_element("id", "scale").text
+    assert_quiet(browser)
+
+
+def test_a_state_that_no_asset_has_cannot_be_chosen(browser, strange):
+    open_page(browser, strange)
+    chips = browser.find_elements("css selector", "#statelist .chip")
+    counts = {one.text: one.is_enabled() for one in chips}
+    assert {text.endswith(" 0") for text in counts} == {True, False}
+    assert all(enabled != text.endswith(" 0") for text, enabled in counts.items())
 
 
 def test_no_text_of_a_store_that_verify_accepts_runs(browser, strange):

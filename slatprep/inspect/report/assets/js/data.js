@@ -23,7 +23,9 @@ const withoutPath = (reason) => reason.replace(new RegExp(CONTENT.path), "");
 
 const SYMBOLS = { youngs_modulus: "E", density: "ρ", poissons_ratio: "ν" };
 const PROPERTY_NAMES = {};
-for (const { name, title, unit } of CONTENT.properties) {
+for (const property of CONTENT.properties) {
+  const { name, title, unit } = property;
+  property.key = `property.${name}`; // A source may call a property anything, "distance" too.
   PROPERTY_NAMES[name] = { name: title[0].toUpperCase() + title.slice(1), symbol: SYMBOLS[name] ?? title, unit };
 }
 
@@ -85,7 +87,7 @@ const Data = (() => {
     const field = coordinates(take(side ** 3 / 8));
     const n = slat.length / 3;
     const material = take(n);
-    const properties = Object.fromEntries(CONTENT.properties.map(({ name }) => [name, take(n)]));
+    const properties = Object.fromEntries(CONTENT.properties.map(({ key }) => [key, take(n)]));
     const distance = take(n);
     const fieldMaterial = take(field.length / 3);
     return { slat, field, material, ...properties, distance, fieldMaterial, moved: at < bytes.length ? steps(take(bytes.length - at)) : null };

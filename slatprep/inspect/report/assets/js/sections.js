@@ -33,7 +33,7 @@ const Sections = (() => {
     );
     byId("statelist").replaceChildren(
       ...counts.filter((state) => CONTENT.records || STORED.includes(state.name)).map((state) =>
-        el("button", { type: "button", class: "chip", title: state.means, onclick: () => filter.only({ states: [state.name] }) }, stateTag(state.name), ` ${Format.count(state.count)}`),
+        el("button", { type: "button", class: "chip", title: state.means, disabled: !state.count, onclick: () => filter.only({ states: [state.name] }) }, stateTag(state.name), ` ${Format.count(state.count)}`),
       ),
     );
     if (unusual) {
@@ -47,10 +47,10 @@ const Sections = (() => {
   function why(filter) {
     const kinds = new Map();
     ASSETS.kinds.forEach((own, index) => {
-      for (const [k, kind] of [...new Set(own)].entries()) {
+      for (const kind of new Set(own)) {
         const state = ASSETS.state[index];
         const key = JSON.stringify([state, kind]);
-        const entry = kinds.get(key) ?? { state, kind, example: ASSETS.reasons[index][k], count: 0 };
+        const entry = kinds.get(key) ?? { state, kind, example: ASSETS.reasons[index][own.indexOf(kind)], count: 0 };
         entry.count++;
         kinds.set(key, entry);
       }

@@ -4,7 +4,7 @@ const Viewer = (() => {
   const { side, levels, NOT_VALID } = Data;
   const MODES = [
     { key: "material", title: "Class" },
-    ...CONTENT.properties.map((property) => ({ key: property.name, title: PROPERTY_NAMES[property.name].symbol, property })),
+    ...CONTENT.properties.map((property) => ({ key: property.key, title: PROPERTY_NAMES[property.name].symbol, property })),
     { key: "distance", title: "Distance" },
   ];
   const AXIS = 0.22;
@@ -229,7 +229,7 @@ const Viewer = (() => {
     if (mode === "material") return CONTENT.classes[step].name;
     if (mode === "distance") return `${((step / (levels - 1)) * CONTENT.scales.max_distance).toFixed(1)} voxel`;
     const { property } = MODES.find((one) => one.key === mode);
-    const { symbol, unit } = PROPERTY_NAMES[mode];
+    const { symbol, unit } = PROPERTY_NAMES[property.name];
     const value = Data.mapped(property, step);
     return `${symbol} ${property.log10 ? Format.scientific(value) : Format.within(property)(value)} ${unit}`.trim();
   }
@@ -291,7 +291,7 @@ const Viewer = (() => {
   /** Make the switches beside the stage. */
   function create() {
     const modes = MODES.map((mode) =>
-      el("button", { type: "button", class: "chip", "data-mode": mode.key, title: mode.property && PROPERTY_NAMES[mode.key].name, "aria-pressed": String(mode.key === state.mode), onclick: () => setMode(mode.key) }, mode.title),
+      el("button", { type: "button", class: "chip", "data-mode": mode.key, title: mode.property && PROPERTY_NAMES[mode.property.name].name, "aria-pressed": String(mode.key === state.mode), onclick: () => setMode(mode.key) }, mode.title),
     );
     byId("colour-by").append(...modes);
     const switches = { slat: "SLAT", field: "PixieVerse boundary", before: "before alignment", turning: "turn" };
