@@ -126,7 +126,7 @@ def align(
 
 
 def _above_ground(field: MaterialField, pair: Pair, found: Alignment) -> Alignment:
-    """Return the best alignment without a flat layer if it is clearly better, else `found`."""
+    """Return the best alignment without a flat layer if that counts as ground, else `found`."""
     cuts = [cut for layer in find_layers(pair.pixie) for cut in _cuts(field, pair, found, layer)]
     best, most = found, -np.inf
     for cut in sorted(cuts, key=lambda cut: -cut.rank)[:TRIED]:
@@ -152,8 +152,7 @@ def _cuts(field: MaterialField, pair: Pair, found: Alignment, layer: Ground) -> 
             candidates = _search(there)
             searched.append(candidates)
         elif searched:
-            poses = [pose for one in searched for pose in (*one.poses, *one.wide)]
-            candidates = searched[-1]._replace(poses=there.polish(poses))
+            candidates = _repolished(there, searched)
         else:
             continue
         width = relative_width(ground, field.occupancy, solid)
@@ -175,9 +174,21 @@ def _search(pair: Pair) -> Candidates:
         wide = pair.polish(refined)
         if wide[0].score > poses[0].score + WIDER_GAIN:
             poses = pair.distinct([*poses, *wide])
-    if poses[0].score >= POOR:
-        poses = pair.distinct([*poses, *repeated(pair, poses[0])])
-    return Candidates(poses, fits, wide, halfway)
+    return Candidates(_with_repeated(pair, poses), fits, wide, halfway)
+
+
+def _repolished(pair: Pair, searched: Sequence[Candidates]) -> Candidates:
+    """Return the placements that searches of almost the same surfaces found, refined on these."""
+    poses = pair.polish([pose for one in searched for pose in (*one.poses, *one.wide)])
+    like = next((one for one in reversed(searched) if one.wide), searched[-1])
+    wide = poses if like.wide else []
+    return Candidates(_with_repeated(pair, poses), like.fits, wide, like.halfway)
+
+
+def _with_repeated(pair: Pair, poses: list[Pose]) -> list[Pose]:
+    if poses[0].score < POOR:
+        return poses
+    return pair.distinct([*poses, *repeated(pair, poses[0])])
 
 
 def _alignment(pair: Pair, candidates: Candidates) -> Alignment:

@@ -45,7 +45,8 @@ RAISED, BETWEEN = (0.0, 1.0), (0.5, 1.5, 2.0)
 the latter ones the placements that the former ones found are refined."""
 
 TRIED = 2
-"""Number of cuts without which placements are finished: those that score best after the search."""
+"""Number of cuts without which placements are finished: those with the largest sum of the score
+after the search and the weighted width."""
 
 GROUND_GAIN, LIKELY_GAIN = 0.05, -0.01
 """Rise of the score without a layer above which the layer is ground. The second one holds for a
@@ -57,7 +58,8 @@ WIDTH, WIDE = 0.3, 1.2
 largest such ratio: wider ones count as this. Ground is seldom the narrower one."""
 
 SEARCHED = 0.01
-"""How much more the score may rise once a placement is finished than it did after the search."""
+"""How much more the score may rise once a placement is finished than it did after the search.
+A rise by deformation alone may be larger, and is not foreseen."""
 
 
 def find_layers(surface: Surface) -> list[Ground]:

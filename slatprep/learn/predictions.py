@@ -222,7 +222,6 @@ def check_prediction(
     converted = ranges is not None and ranges.ranges != columns
     if ranges is not None and converted:
         properties = change_ranges(properties, ranges, normalization)
-        require_normalised(source, properties[used])
     material = given.classes(used, contents.n_classes)
     material = None if material is None else material[order]
     return VoxelPrediction(properties[order], material, converted)

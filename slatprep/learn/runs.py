@@ -179,9 +179,8 @@ class Run:
     def save(self, name: str, state: dict[str, Any]) -> None:
         """Write a checkpoint; an existing one is replaced when the new one is complete."""
         buffer = BytesIO()
-        torch.save(
-            state | {"run": self._digest}, buffer
-        )  # On a full disk torch.save raises no OSError.
+        # On a full disk torch.save raises no OSError.
+        torch.save(state | {"run": self._digest}, buffer)
         with staged(self.path / name) as path:
             path.write_bytes(buffer.getbuffer())
 

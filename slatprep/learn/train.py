@@ -160,7 +160,7 @@ def train(
     in this call alone, and `note` a line if the run is resumed. The training stops after
     `stop_after` epochs, as if interrupted; it ends if it diverges. ConfigError if `out` holds
     another run, a split has no asset, or the training diverges before any epoch can be kept.
-    InputError if a checkpoint is damaged.
+    InputError if a checkpoint is damaged, or of another run.
     """
     opened = open_store(store, copy=True)
     assignment = assign_store(opened, parameters.split_by, parameters.shares)
@@ -182,7 +182,7 @@ def train(
             parameters = replace(parameters, precision=known)
         run.begin(asdict(parameters) | {"store": str(opened.attributes["manifest"])}, assignment)
         session = _Session(parameters, train_set, val_set, device, workers)
-        state = run.load(LAST)
+        state, _ = run.load(LAST), run.load(BEST)
         if state is not None:
             with refusing(run.path / LAST, "cannot be read", "a checkpoint of this run"):
                 session.restore(state)
@@ -213,7 +213,6 @@ def train(
                 references[one.name] = float(_over_objects(val_set, errors))
             run.draw(session.history, references)
         predictions = run.path / PREDICTIONS
-        run.load(BEST)
         _write_predictions(load_checkpoint(run.path / BEST, device), test_set, predictions)
     diverged_in = session.epoch - 1 if session.diverged() else None
     return TrainSummary(session.history, session.best_epoch, references, predictions, diverged_in)

@@ -144,7 +144,7 @@ def _annotations(
             if not source_digests(latents.sources, shared).items() <= digests.items():
                 raise _replaced(one)
         found = before.get(one.sample)
-        alignment = found.alignment if found else _same_alignment(field, annotated)
+        alignment = (found and found.alignment) or _same_alignment(field, annotated)
         judgement = found.judgement if found else None
         annotated.append(annotate(one, field, latents, parameters, alignment, judgement))
     if not annotated:

@@ -25,6 +25,9 @@ FOLDER = Path(__file__).with_name("schema")
 
 _Kind = TypeVar("_Kind")
 
+_NAMES = 2**14
+"""Bytes that other names may add to a record."""
+
 
 class RecordError(StoreError):
     """A record that cannot be read; each fault is told with its place and value."""
@@ -68,11 +71,11 @@ def read_record(kind: type[_Kind], text: bytes | str, where: str) -> _Kind:
 def faults_of(record: AssetRecord) -> tuple[str, ...]:
     """Return the faults for which a record could not be read back; none if it can be.
 
-    A pass over the whole dataset may double the record's size by its `first_pass`; there is none
-    over merged annotations.
+    A pass over the whole dataset may double the record's size by its `first_pass`. There is none
+    over merged annotations, and of these only names may grow.
     """
     text = to_json(record)
-    if len(text) > MAX_RECORD_BYTES // (1 if record.merged else 2):
+    if len(text) > (MAX_RECORD_BYTES - _NAMES if record.merged else MAX_RECORD_BYTES // 2):
         return (f"{len(text):,} bytes",)
     try:
         read_record(AssetRecord, text, record.asset_id)

@@ -168,14 +168,18 @@ def test_where_the_sides_fit_no_ground_is_looked_for(monkeypatch):
     assert align(field_of(chair()), surface_latents(chair()), DEFAULT).ground is None
 
 
-@pytest.mark.parametrize(("radius", "rise", "taken"), [
-    (20, 0.049, False), (20, 0.051, True), (np.inf, -0.011, False), (np.inf, -0.009, True),
+@pytest.mark.parametrize(("radius", "scale", "rise", "taken"), [
+    (20, 1.2, 0.049, False), (20, 1.2, 0.051, True),
+    (np.inf, 1.2, -0.011, False), (np.inf, 1.2, -0.009, True),
+    (np.inf, 1.0, 0.049, False), (np.inf, 1.0, 0.051, True),  # It lies in the ground as on it.
 ])  # fmt: skip
-def test_ground_is_what_the_object_fits_clearly_better_without(radius, rise, taken, monkeypatch):
+def test_ground_is_what_the_object_fits_clearly_better_without(
+    radius, scale, rise, taken, monkeypatch
+):
     """About as well is enough without a layer far wider than it, in which it lay elsewhere."""
     monkeypatch.setattr(engine, "gain", lambda without, found: rise)
     ground = slab(3.0, radius=radius)
-    found = align(field_of(chair() | ground), surface_latents(larger(chair(), 1.2)), DEFAULT)
+    found = align(field_of(chair() | ground), surface_latents(larger(chair(), scale)), DEFAULT)
     assert (found.ground is not None) == taken
 
 

@@ -21,7 +21,7 @@ const unusualOf = (index) => (ASSETS.unusual[index] ?? []).map((line) => `unusua
 /** A reason without the path that it begins with. */
 const withoutPath = (reason) => reason.replace(new RegExp(CONTENT.path), "");
 
-const SYMBOLS = { youngs_modulus: "E", density: "ρ", poissons_ratio: "ν" };
+const SYMBOLS = { __proto__: null, youngs_modulus: "E", density: "ρ", poissons_ratio: "ν" };
 const PROPERTY_NAMES = {};
 for (const property of CONTENT.properties) {
   const { name, title, unit } = property;
