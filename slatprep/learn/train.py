@@ -182,7 +182,8 @@ def train(
             parameters = replace(parameters, precision=known)
         run.begin(asdict(parameters) | {"store": str(opened.attributes["manifest"])}, assignment)
         session = _Session(parameters, train_set, val_set, device, workers)
-        state, _ = run.load(LAST), run.load(BEST)
+        state = run.load(LAST)
+        run.load(BEST)  # If it is of another run, that is told before any epoch.
         if state is not None:
             with refusing(run.path / LAST, "cannot be read", "a checkpoint of this run"):
                 session.restore(state)
