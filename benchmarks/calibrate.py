@@ -33,8 +33,9 @@ from scipy.special import expit
 
 from slatprep.align.pair import TIE
 from slatprep.judge import calibration
+from slatprep.judge.ambiguity import HARMLESS
 from slatprep.judge.confidence import voxel_figures
-from slatprep.judge.evidence import FIGURES, HARMLESS, MEANING, VOXEL_FIGURES, Surroundings
+from slatprep.judge.evidence import FIGURES, MEANING, VOXEL_FIGURES, Surroundings
 from slatprep.judge.model import Logistic, Term
 from slatprep.judge.verdict import THRESHOLDS
 

@@ -56,7 +56,8 @@ from slatprep.inspect.score import (
     read_truth,
 )
 from slatprep.judge import measure_ambiguity
-from slatprep.judge.evidence import HARMLESS, evidence_of, surroundings_of
+from slatprep.judge.ambiguity import HARMLESS
+from slatprep.judge.evidence import evidence_of, surroundings_of
 from slatprep.parameters import (
     AlignParameters,
     BuildParameters,
@@ -278,8 +279,9 @@ def _row(kind: str, asset: Asset, owner: Asset, alignment: Alignment) -> Row:
     asset_id, field, _, _ = asset
     latents, truth = owner[2], owner[3]
     annotation = sample(field, map_of(alignment).places(latents.coords), SampleParameters())
-    around = surroundings_of(field, latents, alignment, annotation)
-    ambiguity = measure_ambiguity(field, latents, alignment, SampleParameters())
+    looked_up = field, latents, alignment, annotation
+    ambiguity, tied = measure_ambiguity(*looked_up, SampleParameters())
+    around = surroundings_of(*looked_up, tied)
     score = compare_with_truth(asset_id, truth, field, latents, annotation)
     valid = np.flatnonzero(annotation.valid)
     chosen = valid[np.linspace(0, len(valid) - 1, min(VOXELS, len(valid))).astype(np.intp)]

@@ -53,7 +53,7 @@ from slatprep.geometry.frames import (
     voxel_centres,
 )
 from slatprep.inspect.score import read_truth
-from slatprep.judge.evidence import HARMLESS
+from slatprep.judge.ambiguity import HARMLESS
 from slatprep.learn.dataset import Item, SlatDataset
 from slatprep.normalize import denormalize_properties, to_mapped
 from slatprep.parameters import AlignParameters, WitnessParameters

@@ -16,54 +16,56 @@ from slatprep.sample import same_within, sample
 NOTABLE = 0.1
 """Smallest change of a property that counts, as a share of its extent in the field."""
 
+HARMLESS = 0.05
+"""Largest share of voxels whose labels change between ties that count as one placement."""
+
 MOST_VOXELS = 32_768
-"""Largest number of voxels that are all compared under ties: as many as TRELLIS trains on."""
-
-FEWER = 4
-"""Larger SLATs compare at most `MOST_VOXELS` over this: enough for a share to 1 percent."""
-
-
-def thinning(voxels: int) -> int:
-    """Return the number of a SLAT's voxels over `MOST_VOXELS`, rounded up."""
-    return max(1, -(-voxels // MOST_VOXELS))
+"""Largest number of voxels that are compared under all ties: as many as TRELLIS trains on."""
 
 
 def measure_ambiguity(
     field: MaterialField,
     latents: StructuredLatents,
     alignment: Alignment,
+    annotation: Annotation,
     parameters: SampleParameters,
-) -> Ambiguity:
+) -> tuple[Ambiguity, NDArray[np.float32]]:
     """Measure how the labels change between placements that fit about equally well.
 
     The alignment's transform is compared with the ``placements`` that tie, without a deformation,
-    as they have none. The share counts SLAT voxels that have other labels (`compare_labels`) in
-    any of them. The change of a property is the largest mean absolute change, over the voxels valid
-    in both; of log10 if it is normalised so.
+    as they have none; `annotation` is the lookup under the alignment. The share counts SLAT voxels
+    that have other labels (`compare_labels`) in any of them. The change of a property is the
+    largest mean absolute change, over the voxels valid in both; of log10 if it is normalised so.
 
-    If there are more than `MOST_VOXELS` voxels, an even choice of at most a fourth of that number
-    is compared.
+    The second result is `Surroundings.tied` (N,).
     """
-    times = thinning(len(latents.coords))
-    # The step is odd, as an even one would take only some layers of a grid in order.
-    few = slice(None, None, FEWER * times + 1 if times > 1 else 1)
-    centres = latents.centres[few]
-    differs = np.zeros(len(centres), dtype=bool)
-    change = np.zeros(len(field.table))
-    if alignment.placements:
-        transforms = alignment.transform, *(one.transform for one in alignment.placements)
-        best, *others = (
-            sample(field, places_of(centres, transform), parameters, labels_alone=True)
-            for transform in transforms
-        )
-        for other in others:
-            own, mean = compare_labels(field, best, other)
-            differs |= own
-            change = np.maximum(change, mean)
-    return Ambiguity(
-        material_share=float(differs.mean()),
-        property_change=tuple(change.tolist()),
-    )
+    ties, by = alignment.placements, alignment.settled_by
+    best, differs = annotation, np.zeros(len(latents.coords), dtype=bool)
+    change, tied = np.zeros(len(field.table)), np.zeros(len(differs), dtype=np.float32)
+
+    def under(transform: Array) -> Annotation:
+        places = places_of(latents.centres, transform)
+        return sample(field, places, parameters, labels_alone=True)
+
+    if ties and alignment.deformation is not None:
+        best = under(alignment.transform)
+    # If a SLAT has far more voxels than usual, some ties stand for all.
+    some = ties[:: -(-len(differs) // MOST_VOXELS)]
+    for placement in some:
+        other = under(placement.transform)
+        own, mean = compare_labels(field, best, other)
+        differs |= own
+        change = np.maximum(change, mean)
+        tied += own & other.valid
+    if ties:
+        others = len(ties) / (len(ties) + 1)
+        tied *= np.float32(others / len(some))
+        if tied.mean() <= HARMLESS:
+            tied[:] = 0.0  # Ties count as one: the chosen labels are right as often.
+        elif by is not None:
+            tied *= np.float32(np.nan_to_num(1.0 - by.probability) / others)
+    share = float(differs.mean())
+    return Ambiguity(material_share=share, property_change=tuple(change.tolist())), tied
 
 
 def compare_labels(

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.geometry.frames import VOXEL_SIZE, places_of, split_transform
-from slatprep.judge.ambiguity import NOTABLE, compare_labels, notable, thinning
+from slatprep.judge.ambiguity import HARMLESS, NOTABLE, notable
 from slatprep.normalize import property_extent, to_mapped
 from slatprep.records import UNANNOTATED, Alignment, Annotation, MaterialField, StructuredLatents
-from slatprep.sample import TOLERANCE, same_within, voxel_index_of
+from slatprep.sample import TOLERANCE, same_within
 
 
 class Figure(NamedTuple):
@@ -69,9 +69,6 @@ VOXEL_FIGURES = (
 MARGIN_CAP = 0.3
 """Largest margin; larger margins are reduced to it."""
 
-HARMLESS = 0.05
-"""Largest share of voxels whose labels change between ties that count as one placement."""
-
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
@@ -111,7 +108,11 @@ class Surroundings:
 
 
 def surroundings_of(
-    field: MaterialField, latents: StructuredLatents, alignment: Alignment, annotation: Annotation
+    field: MaterialField,
+    latents: StructuredLatents,
+    alignment: Alignment,
+    annotation: Annotation,
+    tied: NDArray[np.float32],
 ) -> Surroundings:
     """Measure the surroundings of the positions at which SLAT voxels were looked up."""
     from slatprep.geometry.surroundings import labelled, shares_around
@@ -123,32 +124,7 @@ def surroundings_of(
     if alignment.deformation is not None:
         before = places_of(latents.centres, alignment.transform).astype(np.float32)
         moved = np.linalg.norm(annotation.place - before, axis=1) / np.float32(VOXEL_SIZE)
-    tied = _tied(field, latents, alignment, annotation)
     return Surroundings(others, solid, annotation.distance, moved, tied)
-
-
-def _tied(
-    field: MaterialField, latents: StructuredLatents, alignment: Alignment, annotation: Annotation
-) -> NDArray[np.float32]:
-    """Return `Surroundings.tied` (N,)."""
-    tied = np.zeros(len(annotation.place), dtype=np.float32)
-    ties, by = alignment.placements, alignment.settled_by
-    if not ties:
-        return tied
-    # If a SLAT has far more voxels than usual, some ties stand for all.
-    some = ties[:: thinning(len(tied))]
-    for placement in some:
-        there = voxel_index_of(field).at(places_of(latents.centres, placement.transform))
-        properties, material = field.properties[there], field.material[there]
-        held = replace(annotation, properties=properties, material=material)
-        tied += (there >= 0) & compare_labels(field, annotation, held)[0]
-    others = len(ties) / (len(ties) + 1)
-    tied *= np.float32(others / len(some))
-    if tied.mean() <= HARMLESS:
-        tied[:] = 0.0  # Ties count as one: the chosen labels are right as often.
-    elif by is not None:
-        tied *= np.float32(np.nan_to_num(1.0 - by.probability) / others)
-    return tied
 
 
 def _labels_of(

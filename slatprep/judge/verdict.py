@@ -105,8 +105,8 @@ def judge(
     from slatprep.judge.confidence import class_confidence
     from slatprep.judge.evidence import FIGURES, evidence_of, surroundings_of
 
-    ambiguity = measure_ambiguity(field, latents, alignment, parameters)
-    around = surroundings_of(field, latents, alignment, annotation)
+    ambiguity, tied = measure_ambiguity(field, latents, alignment, annotation, parameters)
+    around = surroundings_of(field, latents, alignment, annotation, tied)
     evidence = evidence_of(field, latents, alignment, annotation, around, ambiguity.material_share)
     same, placed = (float(one.probability(evidence)) for one in (SAME_OBJECT, PLACEMENT))
     if alignment.margin < 0.0:
@@ -172,6 +172,7 @@ def voxel_confidence(
     latents: StructuredLatents,
     alignment: Alignment,
     annotation: Annotation,
+    parameters: SampleParameters,
     confidence: float,
 ) -> NDArray[np.float32]:
     """Return the probability (N,) that the class of each SLAT voxel is right; 0 if not valid.
@@ -182,7 +183,8 @@ def voxel_confidence(
     from slatprep.judge.confidence import class_confidence
     from slatprep.judge.evidence import surroundings_of
 
-    around = surroundings_of(field, latents, alignment, annotation)
+    _, tied = measure_ambiguity(field, latents, alignment, annotation, parameters)
+    around = surroundings_of(field, latents, alignment, annotation, tied)
     return class_confidence(around, confidence, annotation.valid)
 
 

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, expit, logsumexp, softmax
 
 from slatprep.geometry.frames import Array, places_of
-from slatprep.judge.ambiguity import compare_labels
-from slatprep.judge.evidence import HARMLESS
+from slatprep.judge.ambiguity import HARMLESS, compare_labels
 from slatprep.parameters import SampleParameters
 from slatprep.records import (
     BACKGROUND,

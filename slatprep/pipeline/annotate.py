@@ -65,7 +65,8 @@ def look_up(
     if judgement is None:
         judgement, likely = judge(field, latents, alignment, annotation, parameters)
     else:
-        likely = voxel_confidence(field, latents, alignment, annotation, judgement.confidence)
+        sure = judgement.confidence
+        likely = voxel_confidence(field, latents, alignment, annotation, parameters, sure)
     return replace(annotation, confidence=likely), judgement
 
 

@@ -316,14 +316,16 @@ def test_without_classes_it_is_said_how_likely_the_properties_are_right(cases, j
 def test_properties_that_differ_little_are_one_label(of_a_chair):
     field, latents, alignment, annotation = of_a_chair
     plain = replace(field, material=np.zeros_like(field.material), classified=False)
-    by_value = voxel_confidence(plain, latents, alignment, annotation, 0.9)
-    by_class = voxel_confidence(field, latents, alignment, annotation, 0.9)
+    by_value = voxel_confidence(plain, latents, alignment, annotation, SampleParameters(), 0.9)
+    by_class = voxel_confidence(field, latents, alignment, annotation, SampleParameters(), 0.9)
     # The chair's two classes have two sets of properties.
     np.testing.assert_array_equal(by_value, by_class)
     noise = np.random.default_rng(0).uniform(0.999, 1.001, field.properties.shape)
     rough = replace(plain, properties=(field.properties * noise).astype(np.float32))
     near = sample(rough, annotation.place, SampleParameters())
-    np.testing.assert_array_equal(voxel_confidence(rough, latents, alignment, near, 0.9), by_value)
+    np.testing.assert_array_equal(
+        voxel_confidence(rough, latents, alignment, near, SampleParameters(), 0.9), by_value
+    )
 
 
 def test_rounding_in_a_store_changes_no_label_where_labels_are_said_to_hold(of_a_chair):
@@ -409,7 +411,9 @@ def of_a_chair() -> OfAChair:
 
 def test_any_engine_is_judged_by_the_same_figures(of_a_chair):
     field, latents, alignment, annotation = of_a_chair
-    around = evidence.surroundings_of(field, latents, alignment, annotation)
+    around = evidence.surroundings_of(
+        field, latents, alignment, annotation, np.zeros(len(annotation.place), np.float32)
+    )
     own = evidence.evidence_of(field, latents, alignment, annotation, around, 0.0)
     bare = replace(alignment, figures=None)
     measured = evidence.evidence_of(field, latents, bare, annotation, around, 0.0)
@@ -419,10 +423,10 @@ def test_any_engine_is_judged_by_the_same_figures(of_a_chair):
 
 def test_doubt_is_where_the_border_is(of_a_chair):
     field, latents, alignment, annotation = of_a_chair
-    likely = voxel_confidence(field, latents, alignment, annotation, 0.9)
+    likely = voxel_confidence(field, latents, alignment, annotation, SampleParameters(), 0.9)
     height = np.abs(latents.coords[:, 2] - 31.5)
     assert likely[height < 1].mean() < likely[height > 8].mean()
-    unsure = voxel_confidence(field, latents, alignment, annotation, 0.2)
+    unsure = voxel_confidence(field, latents, alignment, annotation, SampleParameters(), 0.2)
     assert (unsure <= likely).all() and unsure.mean() < likely.mean()
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +18,10 @@ from slatprep.align.surface import surface_of
 from slatprep.align.warp import Warp
 from slatprep.geometry.frames import make_transform
 from slatprep.geometry.voxels import occupancy_of
+from slatprep.judge.ambiguity import HARMLESS, measure_ambiguity
 from slatprep.judge.confidence import class_confidence, voxel_figures
 from slatprep.judge.evidence import (
     FIGURES,
-    HARMLESS,
     VOXEL_FIGURES,
     Surroundings,
     _labels_of,
@@ -33,6 +34,8 @@ from slatprep.sample import sample
 
 UPSIDE_DOWN = np.diag([-1.0, 1.0, -1.0, 1.0])
 FAR_OFF = make_transform(np.eye(3), [0.5, 0.5, 0.5])
+
+NO_TIES = np.zeros(99, np.float32)
 
 FIT = records.FitFigures(
     score_slat=0.81, score_pixieverse=0.72, score_similarity=0.63,
@@ -47,6 +50,11 @@ def fitted(transform: np.ndarray | None = None, *ties: np.ndarray) -> records.Al
     quality = records.Quality(0.9, 0.5, 0.8, 0.5, 0.7, 1.0)
     first = np.eye(4) if transform is None else transform
     return aligned(first, *ties, quality=quality, margin=0.2, figures=FIT)
+
+
+def tied_of(*looked_up: Any) -> np.ndarray:
+    """Return `Surroundings.tied` of field, latents, alignment and annotation."""
+    return measure_ambiguity(*looked_up, SampleParameters())[1]
 
 
 def column(
@@ -159,7 +167,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
     field = field_of(tower, np.where(GRID[..., 2] < 32, 1, 3))
     latents = latents_of(np.array([[32, 32, 31], [32, 32, 29], [32, 32, 10], [32, 32, 1]]))
     annotation = annotated(np.array([1, 1, 1, 255]), latents.centres)
-    around = surroundings_of(field, latents, fitted(), annotation)
+    around = surroundings_of(field, latents, fitted(), annotation, NO_TIES[:4])
     # Of 14 cells one and four lie above: 1, 2, 4, 7 voxels along the axis, 1, 1, 2, 4 diagonally.
     above = np.array([[5, 5, 5, 5], [0, 0, 1, 5], [0, 0, 0, 0]]) / 14
     np.testing.assert_allclose(around.others[:3], above, rtol=1e-6)
@@ -167,7 +175,7 @@ def test_shares_around_voxels_are_of_other_classes_and_of_all_that_is_annotated(
     below = np.array([0, 1, 5, 5]) / 14  # that lie outside the grid
     np.testing.assert_allclose(around.solid[3], 1 - below, rtol=1e-6)
     np.testing.assert_allclose(around.depth, [0.5, 0.5, 0.5, 0.5 - 1 / 14], rtol=1e-6)
-    assert not around.moved.any() and not around.tied.any()
+    assert not around.moved.any()
 
 
 def test_how_far_a_deformation_moves_is_measured_in_the_frame_of_the_annotation():
@@ -176,7 +184,9 @@ def test_how_far_a_deformation_moves_is_measured_in_the_frame_of_the_annotation(
     alignment = replace(fitted(make_transform(np.eye(3), scale=0.5)), deformation=pushed)
     steps = np.linspace(0.0, 3.0, len(latents.coords))
     place = 2.0 * latents.centres + steps[:, None] * np.array([0.6, 0.0, 0.8]) / 64
-    around = surroundings_of(field, latents, alignment, replace(annotation, place=place))
+    around = surroundings_of(
+        field, latents, alignment, replace(annotation, place=place), NO_TIES[: len(place)]
+    )
     np.testing.assert_allclose(around.moved, steps, atol=1e-4)
 
 
@@ -195,26 +205,26 @@ def test_ties_count_by_how_many_of_them_change_the_class(most, ties, share, monk
     field, latents, annotation = column(5)
     # Turned upside down the five lower and the five upper of twenty layers change classes.
     changes = np.isin(latents.coords[:, 2], [*range(22, 27), *range(37, 42)])
-    tied = surroundings_of(field, latents, fitted(None, *ties), annotation).tied
+    tied = tied_of(field, latents, fitted(None, *ties), annotation)
     np.testing.assert_allclose(tied, np.where(changes, share, 0.0), rtol=1e-6)
     # Once settled, the others together have what the choice's probability leaves.
     left = share * (len(ties) + 1) / len(ties)
     for probability, other in ((1.0, 0.0), (0.8, 0.2), (np.nan, 0.0)):
         by = records.Consensus(np.eye(3), 5, 5, probability=probability)
         settled = replace(fitted(None, *ties), settled_by=by)
-        tied = surroundings_of(field, latents, settled, annotation).tied
+        tied = tied_of(field, latents, settled, annotation)
         np.testing.assert_allclose(tied, np.where(changes, other * left, 0.0), atol=1e-7)
 
 
 def test_ties_that_change_few_classes_count_as_one():
     # Of 40 voxels in 20 layers four change by a painted layer, by a half each.
     field, latents, annotation = column(2)
-    tied = surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied
+    tied = tied_of(field, latents, fitted(None, UPSIDE_DOWN), annotation)
     assert tied.mean() == pytest.approx(8 / 40 / 2)
     one = np.where(np.arange(40) == 0, 3, 1).astype(np.uint8)  # two voxels change: 2 / 40 / 2
     field = replace(field, material=one, properties=np.ones_like(field.properties))
     annotation = sample(field, latents.centres, SampleParameters())
-    assert not surroundings_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).tied.any()
+    assert not tied_of(field, latents, fitted(None, UPSIDE_DOWN), annotation).any()
 
 
 def test_rounding_beside_what_counts_as_the_same_decides_whether_labels_of_ties_hold():

@@ -185,8 +185,8 @@ def confidence_findings(asset: StoredAsset, record: AssetRecord) -> Iterator[Fin
     annotation = Annotation(properties, asset.material, asset.valid, asset.distance, asset.place)
     if not labels_hold(field, annotation, roundings(asset.store.normalization), tied):
         return  # The confidence may come from other labels than the rounded values give.
-    confidence = record.judgement.confidence
-    likely = voxel_confidence(field, asset.latents, record.alignment, annotation, confidence)
+    given = record.alignment, annotation, record.parameters.sample, record.judgement.confidence
+    likely = voxel_confidence(field, asset.latents, *given)
     fine = np.abs(likely - asset.confidence) <= CONFIDENCE_TOLERANCE
     expected = "what the grid, the places and the record give"
     if record.code != code_fingerprint():
