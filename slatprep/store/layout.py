@@ -99,12 +99,14 @@ ARRAYS = (
     _asset("model", "str", "rigid, similarity, affine or deformable"),
     _asset("search", "str", "starts that were needed"),
     _asset("fitness", "float64",
-        "share of PixieVerse's outer boundary voxels with one of the SLAT's within the radius"),
+        "share of PixieVerse's outer boundary voxels with one of the SLAT's within the radius, "
+        "before any deformation"),
     _asset("inlier_rmse", "float64", "rms distance of those", unit="voxel"),
     _asset("fitness_backward", "float64",
-        "share of the SLAT's outer boundary voxels with one of PixieVerse's within the radius"),
+        "share of the SLAT's outer boundary voxels with one of PixieVerse's within the radius, "
+        "before any deformation"),
     _asset("inlier_rmse_backward", "float64", "rms distance of those", unit="voxel"),
-    _asset("overlap", "float64", "overlap of the two voxel surfaces"),
+    _asset("overlap", "float64", "overlap of the two voxel surfaces, before any deformation"),
     _asset("margin", "float64",
         "score above the next distinct placement; below 0 where another beats a stated frame"),
     _asset("ambiguity", "float64",
