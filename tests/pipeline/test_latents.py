@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.made_store import edit_attributes
 from support.synthetic import Dataset, MakeDataset
+from support.tiny import TINY
 from support.trees import records_beside, records_of, tree
 
 from slatprep import build_store, concat_stores, export_store, open_store
@@ -155,7 +156,7 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
     np.testing.assert_allclose(store.contents.latents.std, every.std(axis=0), rtol=1e-5)
 
     run = tmp_path / "run"
-    train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
+    train(out, run, TrainParameters(size=TINY, epochs=1, precision="fp32"))
     checkpoint = load_checkpoint(run)
     assert checkpoint.contents == store.contents
     asset = store.asset("a")
