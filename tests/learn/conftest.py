@@ -5,15 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import support.tiny  # noqa: F401 -- from here on its size is known
 import torch
 from support.synthetic import Dataset
 
-from slatprep.learn import decoder
 from slatprep.pipeline.dataset import build_store
 from slatprep.store import open_store
-
-# Nothing but time depends on the size of the decoder that is trained.
-decoder.SIZES["tiny"] = decoder.DecoderSize(24, 2, 2)
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.commands import run
+from support.tiny import TINY
 
 from slatprep import build_store, compare_stores, concat_stores, export_store, open_store
 from slatprep.demo import make_demo
@@ -146,7 +147,7 @@ def test_stores_of_other_grids_are_not_joined_and_have_no_voxel_in_common(demo, 
 
 def test_a_decoder_is_trained_and_used_on_its_grid(demo, tmp_path):
     trained = tmp_path / "run"
-    chosen = TrainParameters(epochs=1, size="small", keep="last", shares=Shares(0.5, 0.0, 0.5))
+    chosen = TrainParameters(epochs=1, size=TINY, keep="last", shares=Shares(0.5, 0.0, 0.5))
     train(demo / "s.zarr", trained, chosen)
     out = tmp_path / "predictions"
     run("predict", demo / "s.zarr", "--checkpoint", trained, "--out", out)

@@ -236,7 +236,7 @@ def test_a_few_kills_at_random_times(reference):
     for turn in range(4):
         dataset.add("d", seed=turn)
         build = Build(dataset, out, jobs=2)
-        time.sleep(chance.uniform(0.1, 2.0))  # A build takes that long.
+        time.sleep(chance.uniform(0.1, 1.0))  # A build takes that long.
         build.kill_all()
         stored = open_store(out)
         assert all(len(stored.asset(asset_id).coords) for asset_id in stored.ids)

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.made_store import edit_attributes
-from support.synthetic import Dataset
+from support.synthetic import Dataset, MakeDataset
+from support.tiny import TINY
 from support.trees import records_beside, records_of, tree
 
 from slatprep import build_store, concat_stores, export_store, open_store
@@ -31,6 +32,12 @@ def rewrite(dataset: Dataset, change: Callable[[np.ndarray], np.ndarray]) -> Non
         dataset.write_slat(f"{name}.npz", asset.coords, asset.feats)
 
 
+@pytest.fixture
+def pair(make_dataset: MakeDataset) -> Dataset:
+    """Two assets, which together tell whether latents are standardised."""
+    return make_dataset("a", "b")
+
+
 def of_latents(warnings: tuple[str, ...]) -> list[str]:
     """Return what is said of latents; of the dataset's objects some have one grid."""
     return [text for text in warnings if "latents" in text]
@@ -43,39 +50,39 @@ def test_a_store_says_which_encoder_made_its_latents(mixed_build):
     assert open_store(mixed_build.store).attributes["latents"] == latents | moments
 
 
-def test_standardised_latents_are_named_and_never_standardised_twice(dataset, tmp_path):
-    raw = {name: asset.feats.copy() for name, asset in dataset.assets.items()}
-    rewrite(dataset, lambda feats: (feats - MEAN) / STD)
+def test_standardised_latents_are_named_and_never_standardised_twice(pair, tmp_path):
+    raw = {name: asset.feats.copy() for name, asset in pair.assets.items()}
+    rewrite(pair, lambda feats: (feats - MEAN) / STD)
     out = tmp_path / "s.zarr"
-    (warning,) = of_latents(build_store(dataset.parameters(), out).warnings)
+    (warning,) = of_latents(build_store(pair.parameters(), out).warnings)
     assert "look standardised already" in warning and 'standardised = "yes" in [slat]' in warning
     store = open_store(out)
     assert store.contents.latents.standardised
-    np.testing.assert_array_equal(store.asset("a").feats, dataset.assets["a"].feats)
+    np.testing.assert_array_equal(store.asset("a").feats, pair.assets["a"].feats)
 
     data = SlatDataset(store)
     item = data[data.asset_ids.index("a")]
-    np.testing.assert_array_equal(item.feats.numpy(), dataset.assets["a"].feats)
+    np.testing.assert_array_equal(item.feats.numpy(), pair.assets["a"].feats)
     export_store(out, tmp_path / "npz", "npz", assets=["a"])
     with np.load(next((tmp_path / "npz").glob("**/a.npz"))) as file:
         np.testing.assert_allclose(file["feats"], raw["a"], atol=1e-5)
 
     # Said outright, nobody warns; said wrongly, it is done as said.
     for said in ("yes", "no"):
-        summary = build_store(dataset.parameters(slat={"standardised": said}), out)
+        summary = build_store(pair.parameters(slat={"standardised": said}), out)
         assert of_latents(summary.warnings) == []
         assert open_store(out).contents.latents.standardised == (said == "yes")
 
 
-def test_all_latents_unlike_what_is_said_are_told_so(dataset, tmp_path):
-    parameters = dataset.parameters(slat={"standardised": "yes"})
+def test_all_latents_unlike_what_is_said_are_told_so(pair, tmp_path):
+    parameters = pair.parameters(slat={"standardised": "yes"})
     told = of_latents(build_store(parameters, tmp_path / "s.zarr").warnings)
     said = 'look as the encoder gives them, and slat.standardised is "yes": is that so?'
     assert any(text.endswith(said) for text in told)
 
 
-def test_warnings_follow_what_is_said_of_latents_later(dataset, tmp_path):
-    rewrite(dataset, lambda feats: (feats - MEAN) / STD)
+def test_warnings_follow_what_is_said_of_latents_later(pair, tmp_path):
+    rewrite(pair, lambda feats: (feats - MEAN) / STD)
     other = {name: getattr(TRELLIS, name) for name in ("channels", "resolution", "mean")}
     path = tmp_path / "other.json"
     path.write_text(json.dumps({**other, "encoder": "other", "std": [9.0] * 8}))
@@ -83,7 +90,7 @@ def test_warnings_follow_what_is_said_of_latents_later(dataset, tmp_path):
     for number, slat in enumerate(({}, {"standardised": "yes"}, {"encoder": str(path)}, {})):
         fresh = tmp_path / f"{number}.zarr"
         for out in (updated, fresh):
-            build_store(dataset.parameters(slat=slat), out)
+            build_store(pair.parameters(slat=slat), out)
         assert tree(updated) == tree(fresh), slat
 
 
@@ -149,7 +156,7 @@ def test_other_widths_are_stored_trained_on_and_predicted_from(dataset, tmp_path
     np.testing.assert_allclose(store.contents.latents.std, every.std(axis=0), rtol=1e-5)
 
     run = tmp_path / "run"
-    train(out, run, TrainParameters(size="small", epochs=1, precision="fp32"))
+    train(out, run, TrainParameters(size=TINY, epochs=1, precision="fp32"))
     checkpoint = load_checkpoint(run)
     assert checkpoint.contents == store.contents
     asset = store.asset("a")
@@ -229,12 +236,12 @@ def of_both(dataset: Dataset) -> BuildParameters:
     return dataset.parameters(slat=slat)
 
 
-def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
-    both, out = write_both(dataset), tmp_path / "s.zarr"
-    assert build_store(of_both(dataset), out).statuses["ok"] == 6
+def test_texture_latents_stand_behind_those_of_the_shape(pair, tmp_path):
+    both, out = write_both(pair), tmp_path / "s.zarr"
+    assert build_store(of_both(pair), out).statuses["ok"] == 2
     store = open_store(out)
     for asset in store:
-        np.testing.assert_array_equal(asset.coords, dataset.assets[asset.asset_id].coords)
+        np.testing.assert_array_equal(asset.coords, pair.assets[asset.asset_id].coords)
         np.testing.assert_array_equal(asset.feats, both[asset.asset_id])
     space = store.contents.latents
     assert (space.encoder, space.channels, len(space.std)) == ("trellis2-shape-pbr", 64, 64)
@@ -243,11 +250,11 @@ def test_texture_latents_stand_behind_those_of_the_shape(dataset, tmp_path):
     assert ("texture", "pbr_latents/tex_enc_1024/a.npz") in paths
     assert verify_store(out, sources=True).ok
     # Texture that changes alone is noticed.
-    path = dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz"
+    path = pair.root / "trellis2/pbr_latents/tex_enc_1024/a.npz"
     with np.load(path) as held:
         np.savez(path, coords=held["coords"], feats=held["feats"] + 1)
     assert not verify_store(out, sources=True).ok
-    assert build_store(of_both(dataset), out).statuses["ok"] == 6
+    assert build_store(of_both(pair), out).statuses["ok"] == 2
     assert verify_store(out, sources=True).ok
     both["a"][:, 32:] += 1
     np.testing.assert_array_equal(open_store(out).asset("a").feats, both["a"])
@@ -269,10 +276,10 @@ def loop_at(folder: Path) -> None:
         "has other voxels than a.npz of the shape",
     ),
 ])  # fmt: skip
-def test_texture_latents_that_do_not_belong_are_refused(dataset, change, words):
-    write_both(dataset)
-    change(dataset.root / "trellis2/pbr_latents/tex_enc_1024/a.npz")
-    pairs = discover(of_both(dataset))
+def test_texture_latents_that_do_not_belong_are_refused(pair, change, words):
+    write_both(pair)
+    change(pair.root / "trellis2/pbr_latents/tex_enc_1024/a.npz")
+    pairs = discover(of_both(pair))
     with pytest.raises(InputError, match=words):
         read_latents(pairs[0])
     assert len(look(pairs)) == len(pairs)

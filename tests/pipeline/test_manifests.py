@@ -1,11 +1,12 @@
 """The lines of records beside a store, which an update writes where they changed."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.synthetic import Dataset, Made, MakeDataset, make_asset
+from support.synthetic import Dataset, Made, make_asset
 from support.trees import inodes, records_of
 
 from slatprep.inspect.verify import verify_store
@@ -17,12 +18,20 @@ from slatprep.store.records import build_in
 pytestmark = pytest.mark.usefixtures("files_are_old", "few_are_new")
 
 
-@pytest.fixture
-def built(make_dataset: MakeDataset, tmp_path: Path) -> Made:
-    """Three assets and one without a partner, and the file of their records."""
-    dataset = make_dataset("a", "c", "e")
+@pytest.fixture(scope="module")
+def ace(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Three assets, one without a partner and the store of them; nobody may change them."""
+    dataset = Dataset(tmp_path_factory.mktemp("ace") / "sources").having(*"ace")
     dataset.write_grid("lone", make_asset(4).grid)
-    build_store(dataset.parameters(), tmp_path / "s.zarr")
+    build_store(dataset.parameters(), dataset.root.with_name("s.zarr"))
+    return dataset
+
+
+@pytest.fixture
+def built(ace: Dataset, tmp_path: Path) -> Made:
+    """Return a copy of them, and the file of their records."""
+    shutil.copytree(ace.root.parent, tmp_path, dirs_exist_ok=True)
+    dataset = Dataset(tmp_path / "sources", dict(ace.assets))
     return dataset, tmp_path / "s.manifests" / "assets.jsonl"
 
 

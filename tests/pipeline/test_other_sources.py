@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from support.commands import document, refused, run
 from support.predictions import write_predictions
 from support.synthetic import QUARTER_TURN, SMALL_SHARDS, make_asset
+from support.tiny import TINY
 
 from slatprep import build_store, compare_stores, export_store, open_store, store_statistics
 from slatprep.demo.sources import write_description, write_vomp, write_voxels
@@ -145,7 +146,7 @@ def test_properties_of_any_table_are_those_of_the_nearest_voxels(tmp_path, form,
 def test_without_classes_no_accuracy_is_claimed(tmp_path):
     write(tmp_path, "abcdefgh", classes=False)
     out, trained = built(tmp_path).path, tmp_path / "run"
-    summary = train(out, trained, TrainParameters(size="small", epochs=1, precision="fp32"))
+    summary = train(out, trained, TrainParameters(size=TINY, epochs=1, precision="fp32"))
     assert np.isnan(summary.history[-1].val_accuracy)
     assert np.isfinite(summary.history[-1].val_loss)
     means = evaluate_store(trained / "predictions", out, split=None).methods[OURS].means
@@ -376,7 +377,7 @@ def test_nine_classes_and_other_properties_go_all_the_way_to_scores(tmp_path):
         # In the thumbnail no class has the colour of another.
         shown = {(index - 1) // SHADES for index in np.unique(thumbnail(asset)) if index}
         assert shown <= set(asset.material.tolist()) and shown & {7, 8}
-    train(out, trained, TrainParameters(size="small", epochs=1, precision="fp32"))
+    train(out, trained, TrainParameters(size=TINY, epochs=1, precision="fp32"))
     means = evaluate_store(trained / "predictions", out, split=None).methods[OURS].means
     assert tuple(means) == ("log10 density", "hardness", "mean", "accuracy")
     assert np.isfinite(means["accuracy"])
@@ -404,7 +405,7 @@ def test_scores_of_many_classes_are_read(tmp_path):
 @pytest.mark.parametrize("side", [48, 96, 256])
 def test_of_a_finer_grid_the_class_of_most_voxels_is_taken_and_the_lowest_of_equal_ones(side):
     rng = np.random.default_rng(0)
-    voxels = np.unique(rng.integers(0, 24, (9000, 3)), axis=0)
+    voxels = np.unique(rng.integers(0, 16, (2700, 3)), axis=0)
     material = rng.integers(0, 254, 6)[rng.integers(0, 6, len(voxels))]
     values = rng.uniform(0.1, 0.4, (len(voxels), 3))
     roots = replace(UNCHECKED, contents=Contents(classes=tuple(class_names(254))))

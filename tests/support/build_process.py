@@ -1,4 +1,4 @@
-"""A build in a process of its own, with a fault in it, forked of one that has imported all."""
+"""A build in a process of its own, with a fault in it, forked of one that is ready to build."""
 
 import contextlib
 import json
@@ -9,18 +9,28 @@ import subprocess
 import sys
 import time
 import traceback
+from functools import cache
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
+from unittest.mock import patch
 
 from slatprep.errors import SlatprepError
 from slatprep.pipeline.dataset import build_store
 from support.faults import environment
 from support.synthetic import Dataset
 
-_FORKS = multiprocessing.get_context("forkserver")
-_FORKS.set_forkserver_preload(
-    ["zarr", "scipy.ndimage", "scipy.spatial", "slatprep.align.field", "slatprep.pipeline.dataset"]
-)
+
+@cache
+def _forks() -> ForkServerContext:
+    """Start what builds are forked of, which imports all and loads the kernels once."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["support.ready"])
+    # What is imported ahead is not looked for where this process looks.
+    with patch.dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)):
+        forkserver.ensure_running()
+    return context
 
 
 def kill_at(step: str, calls: int = 0) -> str:
@@ -40,10 +50,10 @@ class Build:
         self, dataset: Dataset, out: Path, fault: str = "", jobs: int = 1, before: str = ""
     ) -> None:
         variables = environment(dataset.root.parent / "faults", fault)
-        pipes = [_FORKS.Pipe(duplex=False) for _ in range(2)]
+        pipes = [_forks().Pipe(duplex=False) for _ in range(2)]
         self._read = [pipe[0] for pipe in pipes]
         streams = [pipe[1] for pipe in pipes]
-        self._process = _FORKS.Process(
+        self._process = _forks().Process(
             target=_build, args=(dataset, out, jobs, before, variables, streams)
         )
         self._process.start()
