@@ -101,8 +101,8 @@ def rows(browser: Chrome) -> list[str]:
 
 def drawn(browser: Chrome) -> Callable[[], bytes]:
     """Wait until the 3D view shows something; return what takes a picture of it."""
-    script = """const {x, y, width, height} = document.getElementById("canvas")
-        .getBoundingClientRect(); return {x: x + scrollX, y: y + scrollY, width, height, scale: 1}"""
+    script = """const {x, y, width, height} = byId("canvas").getBoundingClientRect();
+        return {x: x + scrollX, y: y + scrollY, width, height, scale: 1}"""
     picture = {"clip": browser.execute_script(script), "optimizeForSpeed": True}
 
     def pixels() -> bytes:
