@@ -149,7 +149,7 @@ def test_damage_bites_and_adds_floaters_one_without_a_label(index):
     assert np.array_equal(made.occupancy, made.grid[..., 3] != 7)
 
 
-@pytest.mark.parametrize("index", range(len(CATALOGUE)))
+@pytest.mark.parametrize("index", range(0, len(CATALOGUE), 2))
 def test_scale_and_tilt_of_each_level(index):
     linear = [asset(index, level).views[0].transform[:3, :3] for level in SAME_SHAPE_LEVELS]
     scales = np.cbrt(np.linalg.det(linear))
@@ -343,11 +343,12 @@ def test_a_nerf_field_is_thick_and_rough_with_hollows_and_blobs():
         unlabelled.append((field == UNLABELLED).sum())
         blobs.append(count - 1)
         hollow.append((ndimage.binary_fill_holes(occupied) & ~occupied).sum())
-        # Above the block's middle nothing of the ground is seen.
-        signed = np.where(body, 0.5 - ndimage.distance_transform_edt(body), 0)
-        signed += np.where(body, 0, ndimage.distance_transform_edt(~body) - 0.5)
+        # Above the block's middle nothing of the ground is seen, nor what is far of the side.
+        body = body[4:30, 8:56, 16:52]
+        inner, outer = map(ndimage.distance_transform_edt, (body, ~body))
+        signed = np.where(body, 0.5 - inner, outer - 0.5)
         u, v = np.meshgrid(np.arange(22.0, 42.0), np.arange(28.0, 38.0))
-        face = np.stack([np.full(u.size, 15.5), u.ravel(), v.ravel()])
+        face = np.stack([np.full(u.size, 15.5 - 4), u.ravel() - 8, v.ravel() - 16])
         thick.append(-ndimage.map_coordinates(signed, face, order=1))
         grounds += occupied[20:44, 20:44, 14].mean() > 0.9
     assert np.mean(thick) == pytest.approx(0.5, abs=0.2) and 0.3 < np.std(thick) < 1.0

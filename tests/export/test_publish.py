@@ -6,9 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import mlcroissant
 import numpy as np
@@ -18,7 +16,6 @@ from click.testing import Result
 from support import commands
 from support.faults import flip
 from support.made_store import make_store, rewrite
-from support.published_hub import PublishedHub
 from support.trees import tree
 
 from slatprep import StoreError
@@ -141,81 +138,57 @@ def test_no_category_is_a_control_character_or_the_row_of_all(copy):
     assert cited in card_of(store, Stated(name="a", cite_as=cited), "s.zarr", [])
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (("--date-published", "2026-99-99"), "'2026-99-99'; expected a day such as 2026-01-31"),
-    (("--date-published", "20260131"), "expected a day such as 2026-01-31"),
-    (("--url", "my page"), "url is 'my page'; expected"),
-    (("--url", "ftp:"), "expected a page such as https://example.org/data"),
-    (("--license", "foo bar"), "license is 'foo bar'; expected an SPDX identifier"),
-    (("--dataset-version", "1.x"), "version is '1.x'; expected three numbers"),
-])  # fmt: skip
-def test_what_is_stated_is_what_it_says(words, said, store, tmp_path):
-    assert said in run(store, "--out", tmp_path / "hub", *words, code=2).stderr
-    assert said in commands.refused("describe", store, *words)
+def test_what_is_stated_is_what_it_says(store, tmp_path):
+    for words, said in (
+        (("--date-published", "2026-99-99"), "'2026-99-99'; expected a day such as 2026-01-31"),
+        (("--date-published", "20260131"), "expected a day such as 2026-01-31"),
+        (("--url", "my page"), "url is 'my page'; expected"),
+        (("--url", "ftp:"), "expected a page such as https://example.org/data"),
+        (("--license", "foo bar"), "license is 'foo bar'; expected an SPDX identifier"),
+        (("--dataset-version", "1.x"), "version is '1.x'; expected three numbers"),
+    ):
+        assert said in run(store, "--out", tmp_path / "hub", *words, code=2).stderr, words
+        assert said in commands.refused("describe", store, *words), words
     for day in ("2026-01-31", "2026-01-31T12:00:00Z"):
         commands.run("describe", store, "--date-published", day, "--url", "https://a.org/b")
 
 
-@pytest.fixture(scope="module")
-def hub(root: Path) -> Iterator[str]:
-    """Serve the datasets as the hub does; return the address."""
+def test_a_store_is_read_from_the_hub_at_the_commit_that_was_opened(root, mixed_build, tmp_path):
     pytest.importorskip("huggingface_hub")
-    with PublishedHub() as server:
-        for folder in (root / "me").iterdir():
-            server.publish(f"me/{folder.name}", folder)
-        yield server.address
-        server.shutdown()
-
-
-def from_hub(hub: str, code: str, tmp_path: Path) -> Any:
-    """Run code in a new process, whose hub this one is, and return what it printed last."""
-    none = dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"), "")
-    home = {"HF_ENDPOINT": hub, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
-    command, variables = [sys.executable, "-c", code], os.environ | none | home
-    done = subprocess.run(command, capture_output=True, text=True, env=variables)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def test_a_store_is_read_from_the_hub(hub, mixed_build, tmp_path):
+    (tmp_path / "empty").mkdir()
+    folders = [str(root / "me" / "store"), str(tmp_path / "empty")]
     code = (
-        "import hashlib, json, slatprep\n"
+        "import hashlib, json, os, pathlib, sys\n"
+        f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
+        "from support.published_hub import PublishedHub\n"
+        f"hub, (first, last) = PublishedHub(), map(pathlib.Path, {folders!r})\n"
+        "hub.publish('me/store', first)\n"
+        "os.environ['HF_ENDPOINT'] = hub.address\n"
+        "import slatprep\n"
         "from slatprep.inspect.verify import verify_store\n"
         "url = 'hf://datasets/me/store/mixed.zarr'\n"
-        "store = slatprep.open_store(url)\n"
-        "sums = [hashlib.sha256(a.properties.tobytes() + a.grid_material.tobytes()).hexdigest()"
-        " for a in store]\n"
+        "opened, sound = slatprep.open_store(url), verify_store(url).ok\n"
         "faults = []\n"
         "for name in ('store/none.zarr', 'nobody/x.zarr'):\n"
         "    try: slatprep.open_store(f'hf://datasets/me/{name}')\n"
         "    except slatprep.StoreError as error: faults.append(str(error))\n"
-        "print(json.dumps([store.ids, sums, verify_store(url).ok, faults]))\n"
+        "hub.publish('me/store', last)\n"
+        "sums = [hashlib.sha256(a.properties.tobytes() + a.grid_material.tobytes()).hexdigest()"
+        " for a in opened]\n"
+        "print(json.dumps([opened.ids, sums, sound, faults]))\n"
     )
-    ids, sums, sound, faults = from_hub(hub, code, tmp_path)
+    none = dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"), "")
+    variables = os.environ | none | {"HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, env=variables)
+    assert done.returncode == 0, done.stderr
+    ids, sums, sound, faults = json.loads(done.stdout.splitlines()[-1])
     store = open_store(mixed_build.store)
     assert ids == store.ids and sound
     for asset, digest in zip(store, sums, strict=True):
         content = asset.properties.tobytes() + asset.grid_material.tobytes()
         assert hashlib.sha256(content).hexdigest() == digest
     assert len(faults) == 2 and all("is not a slatprep store" in fault for fault in faults)
-
-
-def test_a_store_of_the_hub_stays_at_the_commit_that_was_opened(root, mixed_build, tmp_path):
-    (tmp_path / "empty").mkdir()
-    folders = [str(root / "me" / "store"), str(tmp_path / "empty")]
-    code = (
-        f"import json, os, pathlib, sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
-        "from support.published_hub import PublishedHub\n"
-        f"hub, (first, last) = PublishedHub(), map(pathlib.Path, {folders!r})\n"
-        "hub.publish('me/store', first)\n"
-        "os.environ['HF_ENDPOINT'] = hub.address\n"
-        "import slatprep\n"
-        "opened = slatprep.open_store('hf://datasets/me/store/mixed.zarr')\n"
-        "hub.publish('me/store', last)\n"
-        "print(json.dumps([float(one.feats.sum()) for one in opened]))\n"
-    )
-    sums = from_hub("", code, tmp_path)
-    assert sums == [float(one.feats.sum()) for one in open_store(mixed_build.store)]
 
 
 def test_shards_are_a_dataset_of_the_hubs_library(root, mixed_build, tmp_path, monkeypatch):

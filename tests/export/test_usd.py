@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.commands import refused, run
 from support.exports import hold_colours, index_of
@@ -170,6 +170,7 @@ def test_the_scene_has_every_asset_apart_from_the_others(exported):
     assert json.loads((exported / "index.json").read_text())["files"] == ["scene.usda"]
 
 
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(7, 60))
 def test_bins_are_at_most_as_many_as_asked_and_say_their_error(seed, most):
     rng = np.random.default_rng(seed)

@@ -373,6 +373,11 @@ def test_nothing_compared_chooses_nothing():
     assert choice_of(nothing, SURE) is None
 
 
+BOX = np.zeros((64, 64, 64), dtype=bool)
+BOX[16:48, 16:48, 12:52] = True
+SOLIDS = chair(), BOX
+SHELLS = [voxels_of(boundary(solid)) for solid in SOLIDS]
+
 CODES = np.linalg.qr(np.random.default_rng(7).normal(size=(8, 8)))[0]
 
 Latents = Callable[[np.random.Generator, np.ndarray], np.ndarray]
@@ -402,14 +407,10 @@ class Asset:
 
     def __init__(self, number: int, latents: Latents, boxy: bool = False) -> None:
         rng = np.random.default_rng([number, 77])
-        solid = chair()
-        if boxy:
-            solid = np.zeros((64, 64, 64), dtype=bool)
-            solid[16:48, 16:48, 12:52] = True
+        solid, coords = SOLIDS[boxy], SHELLS[boxy]
         low, high = rng.choice(7, 2, replace=False)
         cut = rng.integers(22, 30)
         classes = np.where(GRID[..., 2] < cut, low, high).astype(np.uint8)
-        coords = voxels_of(boundary(solid))
         self.object_id = f"object {number}"
         self.field: MaterialField = field_of(solid, classes)
         self.material = classes[tuple(coords.T.astype(int))]
