@@ -277,12 +277,20 @@ def test_documents_begin_alike_and_say_which_store_as_it_was_typed(store, monkey
 @pytest.mark.parametrize("denied", ["zarr.json", "asset/fitness/c/0", "voxel"])
 def test_a_store_that_may_not_be_read_is_neither_damaged_nor_another_folder(denied, copy, mixed):
     (copy / denied).chmod(0)
-    script = f"{BOUND_BY_PERMISSIONS}\nfrom slatprep.cli import main; main()"
+    script = (
+        f"{BOUND_BY_PERMISSIONS}\nimport json, sys\nfrom slatprep.cli import main\n"
+        "for words in json.loads(sys.argv[1]):\n"
+        "    sys.argv = ['slatprep', *words]\n"
+        "    try: main()\n"
+        "    except SystemExit as end: print('#' * 9, end.code, file=sys.stderr)\n"
+    )
     into = ("build-store", *mixed.sides, "--out", copy)
-    for words in (("info", copy), ("verify", copy), into):
-        told = python("-c", script, *words, code=1).stderr
-        assert "(Permission denied)" in told and str(copy / denied) in told
-        assert "is not a slatprep store" not in told and "Copy the store again" not in told
+    lines = [[str(word) for word in words] for words in (("info", copy), ("verify", copy), into)]
+    *told, rest = python("-c", script, json.dumps(lines)).stderr.split("######### 1\n")
+    assert len(told) == len(lines) and rest == ""
+    for said in told:
+        assert "(Permission denied)" in said and str(copy / denied) in said
+        assert "is not a slatprep store" not in said and "Copy the store again" not in said
 
 
 def test_a_folder_that_may_be_entered_and_not_read_hides_no_store(store, tmp_path):

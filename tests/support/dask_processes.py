@@ -66,6 +66,18 @@ sys.addaudithook(refuse)
 """Hides a folder from a process, but for parts of it, as if it ran on another machine."""
 
 
+FORKING = """
+from multiprocessing import forkserver
+
+forkserver.set_forkserver_preload([
+    "distributed", "numba", "s3fs", "scipy.ndimage", "scipy.spatial", "slatprep.align.field",
+    "slatprep.pipeline.dataset", "slatprep.workers.dask", "zarr",
+])
+forkserver.ensure_running()
+"""
+"""Has a nanny fork its workers of a process that has imported all: who is killed is soon back."""
+
+
 def wait_for_workers(address: str, number: int) -> None:
     """Wait until so many workers are there: one may have been killed just now."""
     with Client(address, set_as_default=False) as client:
@@ -89,6 +101,7 @@ class Processes:
         self.folder = folder
         (folder / "faults.py").write_text(FAULTS)
         (folder / "private.py").write_text(PRIVATE)
+        (folder / "forking.py").write_text(FORKING)
         self._started: list[subprocess.Popen[bytes]] = []
 
     def scheduler(self) -> str:
@@ -110,13 +123,20 @@ class Processes:
             "--local-directory", str(self.folder), *options, path=path, **variables,
         )  # fmt: skip
 
+    def forked(self, address: str, *options: str, **variables: str) -> subprocess.Popen[bytes]:
+        """Start workers that are soon back when they have been killed."""
+        return self.worker(
+            address, "--preload-nanny", str(self.folder / "forking.py"), *options,
+            DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD="forkserver", **variables,
+        )  # fmt: skip
+
     def worker_elsewhere(
         self, address: str, root: Path, **variables: str
     ) -> subprocess.Popen[bytes]:
         """Start a worker that sees nothing of `root` but a disk of its own, and how to fail."""
         disk = self.folder.with_name(f"{self.folder.name}-disk-{len(self._started)}")
         disk.mkdir()
-        return self.worker(
+        return self.forked(
             address, "--local-directory", str(disk), "--preload", str(self.folder / "private.py"),
             TMPDIR=str(disk), SLATPREP_CACHE=str(disk / "cache"),
             ONLY_SEES=os.pathsep.join(map(str, (root, disk, self.folder))), **variables,

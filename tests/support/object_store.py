@@ -5,12 +5,19 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+# moto's own server finds the service of each request in a listing of its folders, and logs it.
 _SERVER = """
-import sys
-from moto.server import ThreadedMotoServer
-server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-server.start()
-print("http://%s:%s" % server.get_host_and_port(), flush=True)
+import sys, threading
+from moto.moto_server.werkzeug_app import MotoRequestHandler, create_backend_app
+from werkzeug.serving import make_server
+
+class Handler(MotoRequestHandler):
+    def log_request(self, *_):
+        pass
+
+server = make_server("127.0.0.1", 0, create_backend_app("s3"), True, request_handler=Handler)
+threading.Thread(target=server.serve_forever, daemon=True).start()
+print("http://%s:%s" % server.server_address, flush=True)
 sys.stdin.read()  # Until whoever started it ends, however that ends.
 """
 

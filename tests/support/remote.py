@@ -29,6 +29,14 @@ def built(folder: Path, *ids: str, seed: int = 0) -> Made:
     return dataset, folder / "s.zarr"
 
 
+def few_files(folder: Path, content: str) -> Path:
+    """Make a folder that an upload takes for a store, as it looks into no file."""
+    folder.mkdir()
+    for name in ("zarr.json", "voxel.json"):
+        (folder / name).write_text(content)
+    return folder
+
+
 def raising(
     error: Exception, method: Any = None, where: Callable[[str, Any], bool] = lambda *_: True
 ) -> Callable[..., Any]:

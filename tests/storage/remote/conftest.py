@@ -10,11 +10,15 @@ import pytest
 from joblib.externals.loky import get_reusable_executor
 from s3fs.core import S3FileSystem
 from support import object_store
-from support.remote import Dataset, Made, built
+from support.remote import Dataset, Made, built, put
 from support.synthetic import MakeDataset
 
 from slatprep.parameters import BuildParameters
 from slatprep.storage.place import place_of
+from slatprep.storage.versions import current_version
+
+Change = Callable[[bytes], bytes]
+"""Returns what takes the place of a file's content; nothing where there shall be no file."""
 
 
 @pytest.fixture(scope="session")
@@ -56,12 +60,16 @@ def s3() -> Any:
     return fsspec.filesystem("s3", use_listings_cache=False)
 
 
-@pytest.fixture
-def bucket(s3: Any) -> str:
-    """Make a bucket of one test."""
+def new_bucket() -> str:
     name = f"bucket-{uuid.uuid4().hex[:12]}"
-    s3.mkdir(name)
+    fsspec.filesystem("s3").mkdir(name)
     return name
+
+
+@pytest.fixture
+def bucket() -> str:
+    """Make a bucket of one test."""
+    return new_bucket()
 
 
 @pytest.fixture(scope="session")
@@ -74,6 +82,33 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def another(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """Return one other asset, and the store of it."""
     return built(tmp_path_factory.mktemp("another"), "z", seed=3)
+
+
+@pytest.fixture(scope="session")
+def published(environment: None, undisturbed: Made) -> str:
+    """Return the URL of the store of three assets; none but `damage` may change what is there."""
+    url = f"s3://{new_bucket()}/stores/demo.zarr"
+    put(undisturbed[1], url)
+    return url
+
+
+@pytest.fixture
+def damage(s3: Any, published: str) -> Iterator[Callable[[str, Change], None]]:
+    """Return what changes a file of the store at `published` until the test ends."""
+    version = current_version(place_of(published))
+    before: dict[str, bytes] = {}
+
+    def put_there(place: str, content: bytes) -> None:
+        s3.pipe_file(place, content) if content else s3.rm_file(place)
+
+    def change(name: str, how: Change) -> None:
+        place = f"{version}/{name}"
+        before[place] = s3.cat_file(place) if s3.exists(place) else b""
+        put_there(place, how(before[place]))
+
+    yield change
+    for place, content in before.items():
+        put_there(place, content)
 
 
 @pytest.fixture

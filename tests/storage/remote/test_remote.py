@@ -186,13 +186,11 @@ def obstore(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("obstore")
-def test_a_store_reads_as_by_s3fs(url, s3, undisturbed, requests, monkeypatch):
-    s3.put(str(undisturbed[1]), url, recursive=True)
-    requests.made.clear()
-    by_obstore = [asset.feats for asset in open_store(url)]
+def test_a_store_reads_as_by_s3fs(published, requests, monkeypatch):
+    by_obstore = [asset.feats for asset in open_store(published)]
     assert requests.of("get_object") == []  # s3fs was asked for no bytes.
     monkeypatch.setenv("SLATPREP_OBSTORE", "no")
-    for here, there in zip(by_obstore, open_store(url), strict=True):
+    for here, there in zip(by_obstore, open_store(published), strict=True):
         np.testing.assert_array_equal(here, there.feats)
     assert requests.of("get_object")
 

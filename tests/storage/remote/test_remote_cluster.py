@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from s3fs.core import S3FileSystem
+from support.commands import run
 from support.dask_processes import Processes, end, wait_for_workers
 from support.faults import environment as with_fault
 from support.faults import wait_until
@@ -28,10 +29,10 @@ from slatprep.workers.dask import Cluster
 def shared(
     environment: None, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Processes, str]]:
-    """A scheduler and three workers, each with a disk of its own."""
+    """A scheduler and two workers, each with a disk of its own."""
     started = Processes(tmp_path_factory.mktemp("dask"))
     address = started.scheduler()
-    for _ in range(3):
+    for _ in range(2):
         started.worker_elsewhere(address, tmp_path_factory.getbasetemp())
     yield started, address
     started.stop()
@@ -39,7 +40,7 @@ def shared(
 
 @pytest.fixture
 def address(shared: tuple[Processes, str]) -> str:
-    wait_for_workers(shared[1], 3)
+    wait_for_workers(shared[1], 2)
     (shared[0].folder / "aligned").unlink(missing_ok=True)
     return shared[1]
 
@@ -59,14 +60,15 @@ def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_
 ):
     faults = shared[0].folder
     put(another[1], url)
-    (tmp_path / "dataset.toml").write_text(definition(uploaded))
+    config = tmp_path / "dataset.toml"
+    config.write_text(definition(uploaded))
+    command = ["build-store", "--config", str(config), "--out", url, "--scheduler", address]
 
     def build(fault: str = "") -> subprocess.Popen[bytes]:
-        command = ["build-store", "--config", "dataset.toml", "--out", url, "--scheduler", address]
         return subprocess.Popen(
             [sys.executable, "-m", "slatprep", *command],
-            cwd=tmp_path, env=with_fault(tmp_path / "faults", fault),
-        )  # fmt: skip
+            env=with_fault(tmp_path / "faults", fault),
+        )
 
     # While one worker holds an asset, and others have been finished.
     (faults / "hold-c").touch()
@@ -85,7 +87,7 @@ def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_
     kills = [faults / f"kill at {step}" for step in ("shard filled", "shard written")]
     for kill in kills:
         kill.touch()
-    assert build().wait(900) == 0
+    run(*command)
     assert not any(kill.exists() for kill in kills)
     assert current(s3, url) == tree(undisturbed[1])
     assert left_behind(s3, url) == set()
@@ -106,7 +108,7 @@ def test_a_worker_without_the_store_is_named(url, uploaded, shared, address, tmp
         address, tmp_path_factory.getbasetemp(), AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY=""
     )
     try:
-        wait_for_workers(address, 4)
+        wait_for_workers(address, 3)
         told = rf"worker tcp://.*: sees nothing it may read .*credentials.* {url}/spool/builder"
         with Cluster(address) as cluster, pytest.raises(SlatprepError, match=told):
             build_store(uploaded, url, jobs=cluster)

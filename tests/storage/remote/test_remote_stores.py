@@ -7,6 +7,7 @@ import pickle
 import shutil
 import tempfile
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -23,7 +24,7 @@ from s3fs.core import S3FileSystem
 from support.commands import document, refused
 from support.faults import inject
 from support.faulty_proxy import Faults, faulty
-from support.remote import current, put, raising, versions
+from support.remote import current, few_files, put, raising, versions
 from support.trees import contents, tree
 
 from slatprep import ConfigError, Store, StoreError, open_store, subset_store
@@ -56,8 +57,8 @@ def test_a_store_built_from_s3_to_s3_equals_the_local_one(s3, url, uploaded, und
     assert not any((tmp_path / "cache").rglob("*.arrays"))
 
 
-def test_a_source_is_never_replaced_on_s3_either(s3, url, undisturbed):
-    put(undisturbed[1], url)
+def test_a_source_is_never_replaced_on_s3_either(s3, published, undisturbed):
+    url = published
     before = versions(s3, url)
     for source in (url, str(open_store(url).path)):
         with pytest.raises(ConfigError, match="is a store to take assets from"):
@@ -79,10 +80,12 @@ def assert_same(left: Store, right: Store) -> None:
         np.testing.assert_array_equal(left[row].grid_properties, right[row].grid_properties)
 
 
-def flip(s3: Any, place: str) -> None:
-    content = bytearray(s3.cat_file(place))
-    content[100] ^= 1
-    s3.pipe_file(place, bytes(content))
+def flipped(content: bytes) -> bytes:
+    return content[:100] + bytes([content[100] ^ 1]) + content[101:]
+
+
+def removed(content: bytes) -> bytes:
+    return b""
 
 
 def test_opening_costs_the_pointer_and_one_more_read(url, undisturbed, requests, tmp_path):
@@ -112,27 +115,23 @@ def test_what_did_not_change_is_neither_aligned_nor_uploaded_again(s3, url, make
     assert contents(s3, url).keys() == first.keys()
 
 
-@pytest.mark.parametrize("gone", [True, False])
-def test_a_damaged_version_is_uploaded_anew(s3, url, make_dataset, gone):
-    dataset = make_dataset("a", "b")
-    build_store(dataset.parameters("pixie"), url)
-    whole = current(s3, url)
-    (key,) = [one for one in contents(s3, url) if one.endswith("voxel/material/c/0")]
-    name = f"{url.removeprefix('s3://')}/{key}"
-    data = s3.cat_file(name)
-    s3.rm_file(name) if gone else s3.pipe_file(name, data[:-1] + bytes([data[-1] ^ 1]))
-    build_store(dataset.parameters("pixie"), url, fresh=True)
-    assert current(s3, url) == whole and verify_store(url).ok
+def test_a_damaged_version_is_uploaded_anew(s3, url, another):
+    put(another[1], url)
+    for damage in (s3.rm_file, lambda name: s3.pipe_file(name, flipped(s3.cat_file(name)))):
+        damage(f"{open_store(url).path}/voxel/material/c/0")
+        build_store(another[0].parameters("pixie"), url, fresh=True)
+        assert current(s3, url) == tree(another[1])
 
 
-def test_one_older_version_is_kept_or_more_are_told(s3, url, undisturbed, another, new_clients):
+def test_one_older_version_is_kept_or_more_are_told(s3, url, another, new_clients, tmp_path):
     first = put(another[1], url)
-    reader, known = open_store(url), open_store(another[1])
-    put(undisturbed[1], url)
-    np.testing.assert_array_equal(reader.read(0)["feats"], known.read(0)["feats"])
+    readers, known = [open_store(url), open_store(first)], open_store(another[1]).read(0)
+    one, other = (few_files(tmp_path / name, name) for name in ("one", "other"))
+    second = put(one, url)
+    for reader in readers:
+        np.testing.assert_array_equal(reader.read(0)["feats"], known["feats"])
     assert first.name in versions(s3, url)
-    third = upload_store(another[1], published_state(place_of(url)))
-    assert third.version.name != first.name
+    third = upload_store(other, published_state(place_of(url)))
     told = r"older versions could not be removed \(Access Denied\)"
 
     def denied(*args: Any, **options: Any) -> None:
@@ -142,14 +141,16 @@ def test_one_older_version_is_kept_or_more_are_told(s3, url, undisturbed, anothe
         client.setattr(S3FileSystem, "call_s3", denied)
         third.publish()
     new_clients()
-    assert current(s3, url) == tree(another[1])
+    assert current(s3, url) == tree(other)
     assert len(versions(s3, url)) == 3
     # The next one removes them.
-    fourth = put(undisturbed[1], url)
+    fourth = put(one, url)
+    assert fourth.name != second.name
     assert versions(s3, url) == {third.version.name, fourth.name}
-    with pytest.raises(StoreError, match=r"voxel/distance/c/0: .*was the store replaced"):
-        reader.read(0, ("distance",))
-    assert_same(open_store(url), open_store(undisturbed[1]))
+    for reader in readers:
+        with pytest.raises(StoreError, match=r"c/0: is missing \(was the store replaced\? Open it"):
+            reader.read(0, ("distance",))
+    assert current(s3, url) == tree(one)
 
 
 def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(url, undisturbed, another):
@@ -168,7 +169,7 @@ def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(url, und
     with ThreadPoolExecutor(1) as pool, ExitStack() as ending:
         ending.callback(stop.set)
         reader = pool.submit(read)
-        for path in (another[1], undisturbed[1], another[1]):
+        for path in (another[1], undisturbed[1]):
             count = len(seen)
             put(path, url)
             while len(seen) < count + 3 and not reader.done():
@@ -177,13 +178,16 @@ def test_who_opens_it_while_it_is_replaced_finds_one_or_the_other_whole(url, und
     assert set(seen) == set(stores)
 
 
-def test_each_fault_of_a_store_is_named(s3, url, undisturbed):
-    version = put(undisturbed[1], url)
-    s3.rm(f"{version}/voxel/coords/c/0/0")
-    flip(s3, f"{version}/voxel/feats/c/0/0")
-    s3.pipe_file(f"{version}/asset/fitness/c/0", s3.cat_file(f"{version}/asset/fitness/c/0")[:-3])
-    s3.pipe_file(f"{version}/stray", b"x")
-    found = {(finding.file, finding.what) for finding in verify_store(url, jobs=1).findings}
+def test_each_fault_of_a_store_is_named(published, damage):
+    url, version = published, open_store(published).path
+    for name, how in (
+        ("voxel/coords/c/0/0", removed), ("voxel/feats/c/0/0", flipped),
+        ("asset/fitness/c/0", lambda content: content[:-3]), ("stray", lambda _: b"x"),
+    ):  # fmt: skip
+        damage(name, how)
+    told = document("verify", url, "--jobs", 1, code=1)
+    assert told["store"] == url
+    found = {(finding["file"], finding["what"]) for finding in told["findings"]}
     assert ("voxel/coords/c/0/0", "is missing") in found
     assert ("voxel/feats/c/0/0", "its bytes changed") in found
     assert ("stray", "belongs to no array") in found
@@ -193,7 +197,7 @@ def test_each_fault_of_a_store_is_named(s3, url, undisturbed):
         store.read(0, ("coords",))
     with pytest.raises(StoreError, match=f"{version}/voxel/feats/c/0/0: chunk 0 is damaged"):
         store.read(0, ("feats",))
-    s3.rm(f"{version}/zarr.json")
+    damage("zarr.json", removed)
     with pytest.raises(StoreError, match=f"{version}/zarr.json does not exist"):
         verify_store(url)
 
@@ -202,39 +206,25 @@ def test_each_fault_of_a_store_is_named(s3, url, undisturbed):
 @pytest.mark.parametrize("lost", [
     "voxel/feats/c/0", "asset/id/c/0", "file/sha256/c/0", "voxel/coords/zarr.json",
 ])  # fmt: skip
-def test_what_the_server_does_not_give_is_not_called_damaged(
-    url, undisturbed, change_client, error, lost
-):
-    put(undisturbed[1], url)
+def test_what_the_server_does_not_give_is_not_called_damaged(published, change_client, error, lost):
     client = raising(error, S3FileSystem._cat_file, lambda path, options: lost in path)
     change_client("_cat_file", client)
     told = rf"{lost}.*: cannot be read \({error}.*check the network and your permissions"
     with pytest.raises(UnreachableError, match=told) as caught:
-        verify_store(url)
+        verify_store(published)
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     if not lost.endswith("zarr.json"):
         with pytest.raises(UnreachableError, match=told):
-            open_store(url).read_rows(lost.removesuffix("/0").removesuffix("/c"), 0, 1)
+            open_store(published).read_rows(lost.removesuffix("/0").removesuffix("/c"), 0, 1)
 
 
-def test_without_the_right_to_list_what_was_never_written_is_denied(
-    url, undisturbed, change_client
-):
-    put(undisturbed[1], url)
+def test_without_the_right_to_list_what_was_never_written_is_denied(published, change_client):
     denied = raising(
         PermissionError("Denied"), S3FileSystem._cat_file, lambda path, _: gone in path
     )
     gone = "asset/category/c/0"
     change_client("_cat_file", denied)
-    assert open_store(url).column("category").tolist() == [""] * 3
-
-
-def test_a_version_that_is_gone_has_to_be_opened_again(s3, url, undisturbed):
-    store = open_store(put(undisturbed[1], url))
-    store.read(0)
-    s3.rm(str(store.path), recursive=True)
-    with pytest.raises(StoreError, match=r"c/0.* is missing \(was the store replaced\? Open it"):
-        store.read(0)
+    assert open_store(published).column("category").tolist() == [""] * 3
 
 
 @pytest.mark.parametrize("obstore", ["yes", "no"])
@@ -283,7 +273,9 @@ def test_a_pointer_that_is_none_is_refused(s3, url, text, undisturbed):
     assert s3.cat_file(f"{url}/current.json") == text
 
 
-def test_places_that_take_nothing_are_told_first(s3, bucket, undisturbed, monkeypatch, new_clients):
+def test_places_that_take_nothing_are_told_first(
+    s3, bucket, published, undisturbed, monkeypatch, new_clients
+):
     parameters = undisturbed[0].parameters("pixie")
     begun: list[str] = []
     inject(monkeypatch, lambda step, name: step == "asset begun" and begun.append(name))
@@ -292,48 +284,47 @@ def test_places_that_take_nothing_are_told_first(s3, bucket, undisturbed, monkey
     s3.pipe_file(f"{bucket}/mine/notes.txt", b"keep")
     with pytest.raises(StoreError, match=f"^s3://{bucket}/mine holds notes.txt and is not"):
         build_store(parameters, f"s3://{bucket}/mine")
-    version = put(undisturbed[1], f"s3://{bucket}/a.zarr")
-    with pytest.raises(StoreError, match=f"is one version .* expected s3://{bucket}/a.zarr$"):
-        build_store(parameters, version)
+    with pytest.raises(StoreError, match=f"is one version .* expected {published}$"):
+        build_store(parameters, open_store(published).path)
     with pytest.raises(StoreError, match="expected a local folder for the records"):
-        build_store(parameters, f"s3://{bucket}/a.zarr", manifests=place_of(f"s3://{bucket}/m"))
+        build_store(parameters, published, manifests=place_of(f"s3://{bucket}/m"))
     monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
     monkeypatch.delenv("AWS_ACCESS_KEY_ID")
     new_clients()
     told = r"cannot be reached .*Unable to locate credentials.*AWS_PROFILE"
     with pytest.raises(StoreError, match=told):
-        build_store(parameters, f"s3://{bucket}/a.zarr")
+        build_store(parameters, published)
     with pytest.raises(StoreError, match=told):
-        open_store(f"s3://{bucket}/a.zarr")
+        open_store(published)
     assert begun == []
 
 
-def test_a_shard_that_finds_no_temporary_file_says_so(url, undisturbed, monkeypatch, tmp_path):
-    put(undisturbed[1], url)
-    store = open_store(url).path
+def test_a_shard_that_finds_no_temporary_file_says_so(published, monkeypatch, tmp_path):
+    store = open_store(published).path
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
     with pytest.raises(StoreError, match="voxel/valid/c/0: cannot be written to s3://"):
         ShardWriter(store, "voxel/valid", 0)
 
 
 @pytest.mark.parametrize("use", ["build", "verify", "info"])
-def test_a_store_that_cannot_be_listed_is_refused_in_words(url, another, change_client, use):
-    put(another[1], url)
+def test_a_store_that_cannot_be_listed_is_refused_in_words(
+    published, undisturbed, change_client, use
+):
     change_client("_lsdir", raising(OSError("connection lost")))
     with pytest.raises(StoreError, match=r"cannot be listed \(connection lost"):
         if use == "build":
-            build_store(another[0].parameters("pixie"), url)
+            build_store(undisturbed[0].parameters("pixie"), published)
         elif use == "verify":
-            verify_store(url)
+            verify_store(published)
         else:
-            overview_of(open_store(url))
+            overview_of(open_store(published))
 
 
 @pytest.mark.parametrize("kind", ["403", "503"])
 def test_a_build_over_a_store_that_does_not_answer_aligns_nothing_anew(
-    url, another, server, monkeypatch, new_clients, kind
+    published, undisturbed, server, monkeypatch, new_clients, kind
 ):
-    put(another[1], url)
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")  # What is refused is soon asked for again.
     begun: list[str] = []
     inject(monkeypatch, lambda step, name: step == "asset begun" and begun.append(name))
     silent = Faults(chance=1.0, kinds=(kind,), lasting=True, only=r"zarr\.json")
@@ -341,7 +332,7 @@ def test_a_build_over_a_store_that_does_not_answer_aligns_nothing_anew(
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy)
         new_clients()
         with pytest.raises(StoreError, match=r"zarr\.json: cannot be read .*run again"):
-            build_store(another[0].parameters("pixie"), url)
+            build_store(undisturbed[0].parameters("pixie"), published)
     assert begun == []
 
 
@@ -361,33 +352,29 @@ def test_a_store_that_may_not_be_read_is_no_other_thing(
     assert "(None)" not in told
 
 
-def test_an_answer_that_zarr_cannot_use_ends_a_command_in_words(url, another, change_client):
-    put(another[1], url)
+def test_an_answer_that_zarr_cannot_use_ends_a_command_in_words(published, change_client):
     error = FlexibleChecksumError(error_msg="another checksum")
     # zarr-python asks for files, slatprep for ranges.
     whole = raising(error, S3FileSystem._cat_file, lambda path, options: not options)
     change_client("_cat_file", whole)
-    told = refused("describe", url, code=1)
+    told = refused("describe", published, code=1)
     assert "bad metadata" in told and "another checksum" in told
 
 
-def test_records_nobody_can_ask_for_end_a_command_in_words(url, another, change_client, tmp_path):
-    put(another[1], url)
+def test_records_nobody_can_ask_for_end_a_command_in_words(published, change_client, tmp_path):
     lost = OSError("connection lost")
     deaf = raising(lost, S3FileSystem._info, lambda path, options: "/manifests/" in path)
     change_client("_info", deaf)
     with pytest.raises(StoreError, match=r"manifests/.*: cannot be reached \(connection lost"):
-        verify_store(url)
-    told = refused("subset", url, "--asset", "z", "--out", tmp_path / "s.zarr", code=1)
+        verify_store(published)
+    told = refused("subset", published, "--asset", "a", "--out", tmp_path / "s.zarr", code=1)
     assert "connection lost" in told
     assert not (tmp_path / "s.zarr").exists()
 
 
-def test_a_command_names_the_url_that_was_given(url, undisturbed, tmp_path):
-    put(undisturbed[1], url)
-    assert document("verify", url)["store"] == url
-    told = refused("publish", url, "--out", tmp_path / "hub")
-    assert f"is on no local disk; `slatprep subset {url}/versions/" in told
+def test_a_store_that_is_no_folder_is_not_published_and_its_url_named(published, tmp_path):
+    told = refused("publish", published, "--out", tmp_path / "hub")
+    assert f"is on no local disk; `slatprep subset {published}/versions/" in told
 
 
 @pytest.mark.parametrize(("call", "said"), [
@@ -395,28 +382,27 @@ def test_a_command_names_the_url_that_was_given(url, undisturbed, tmp_path):
     ("_get_file", r"cannot be copied to .*Access Denied"),
 ])  # fmt: skip
 def test_a_transfer_that_fails_ends_in_one_error(
-    call, said, url, undisturbed, change_client, recwarn
+    call, said, published, url, tmp_path, change_client, recwarn
 ):
+    store = few_files(tmp_path / "s.zarr", "{}")
+
     async def denied(*given: Any, **options: Any) -> None:
         raise PermissionError("Access Denied")
 
-    if call == "_get_file":
-        put(undisturbed[1], url)
     change_client(call, denied)
     with pytest.raises(StoreError, match=said):
         if call == "_get_file":
-            open_store(url, copy=True)
+            open_store(published, copy=True)
         else:
-            put(undisturbed[1], url)
+            put(store, url)
     gc.collect()
     assert not [one for one in recwarn if "never awaited" in str(one.message)]
 
 
-def test_errors_measured_where_nothing_may_be_written_are_told(url, undisturbed, change_client):
-    put(undisturbed[1], url)
+def test_errors_measured_where_nothing_may_be_written_are_told(published, change_client):
     change_client("_put_file", raising(PermissionError("Access Denied")))
     with pytest.warns(UserWarning, match=r"decoys.json: .* could not be kept \(Access Denied\)"):
-        assert measure_errors(open_store(url), decoys=1).decoys
+        assert measure_errors(open_store(published), decoys=1).decoys
 
 
 def test_an_error_that_no_room_has_words_for_is_one_line(another, monkeypatch):
@@ -440,9 +426,8 @@ def test_records_may_be_kept_on_the_local_disk(s3, url, make_dataset, tmp_path):
     assert again.records.read_text().count("\n") == 1
 
 
-def test_a_forked_process_reads_on(url, undisturbed):
-    put(undisturbed[1], url)
-    store = open_store(url)
+def test_a_forked_process_reads_on(published, undisturbed):
+    store = open_store(published)
     store.read(0)
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
@@ -468,59 +453,59 @@ def test_a_copy_is_made_once_and_no_name_leads_out(s3, url, undisturbed, request
     assert storage_of(undisturbed[1]).copied_version() == undisturbed[1]
 
 
-@pytest.mark.parametrize("how", ["removed", "cut", "emptied", "flipped", "a file", "[]", "{}"])
-def test_a_damaged_copy_is_made_again(url, undisturbed, how):
-    put(undisturbed[1], url)
-    copy = Path(str(open_store(url, copy=True).path))
-    file = copy / "voxel/material/c/0"
-    if how == "emptied":
+def test_a_damaged_copy_is_made_again(published, undisturbed):
+    copy, whole = Path(str(open_store(published, copy=True).path)), tree(undisturbed[1])
+    file, sizes = copy / "voxel/material/c/0", copy.with_name(".demo.zarr.sizes")
+
+    def replace_by(make: Callable[[Path], object]) -> None:
         shutil.rmtree(copy)
-        copy.mkdir()
-    elif how == "a file":
-        shutil.rmtree(copy)
-        copy.write_text("")
-    elif how == "cut":
-        file.write_bytes(file.read_bytes()[:-1])
-    elif how == "flipped":
-        root = (copy / "zarr.json").read_bytes()
-        (copy / "zarr.json").write_bytes(root.replace(b"slatprep", b"slatpreq"))
-    else:
-        file.unlink()
-        if how in ("[]", "{}"):
-            copy.with_name(".demo.zarr.sizes").write_text(how)
-    assert Path(str(open_store(url, copy=True).path)) == copy
-    assert tree(copy) == tree(undisturbed[1])
+        make(copy)
+
+    damages: dict[str, Callable[[], object]] = {
+        "removed": file.unlink,
+        "cut": lambda: file.write_bytes(file.read_bytes()[:-1]),
+        "emptied": lambda: replace_by(Path.mkdir),
+        "flipped": lambda: (copy / "zarr.json").write_bytes(
+            (copy / "zarr.json").read_bytes().replace(b"slatprep", b"slatpreq")
+        ),
+        "a file": lambda: replace_by(Path.touch),
+        "[]": lambda: (file.unlink(), sizes.write_text("[]")),
+        "{}": lambda: (file.unlink(), sizes.write_text("{}")),
+    }
+    for how, damage in damages.items():
+        damage()
+        assert Path(str(open_store(published, copy=True).path)) == copy, how
+        assert tree(copy) == whole, how
 
 
-def test_a_damaged_shard_of_a_copy_says_what_to_remove(url, undisturbed, monkeypatch):
+def test_a_damaged_shard_of_a_copy_says_what_to_remove(published, monkeypatch):
     monkeypatch.setattr("slatprep.storage.cache.SMALL_BYTES", 0)
-    put(undisturbed[1], url)
-    copy = Path(str(open_store(url, copy=True).path))
-    shard = bytearray((copy / "voxel/feats/c/0/0").read_bytes())
-    shard[100] ^= 1
-    (copy / "voxel/feats/c/0/0").write_bytes(shard)
+    copy = Path(str(open_store(published, copy=True).path))
+    shard = copy / "voxel/feats/c/0/0"
+    whole = shard.read_bytes()
+    shard.write_bytes(flipped(whole))
     with pytest.raises(StoreError, match=f"damaged.* Remove {copy}, a copy, and open the store"):
-        open_store(url, copy=True).read(0)
+        open_store(published, copy=True).read(0)
     own = shutil.copytree(copy, copy.with_name("own.zarr"))  # No copy, though it lies in the cache.
     with pytest.raises(StoreError, match="Copy the store again, or build it"):
         open_store(own).read(0)
     shutil.rmtree(copy)
-    assert_same(open_store(url, copy=True), open_store(undisturbed[1]))
+    open_store(published, copy=True)
+    assert shard.read_bytes() == whole
 
 
-def test_a_copy_that_differs_from_what_was_published_is_none(s3, url, undisturbed, tmp_path):
-    flip(s3, f"{put(undisturbed[1], url)}/voxel/feats/c/0/0")
+def test_a_copy_that_differs_from_what_was_published_is_none(published, damage, tmp_path):
+    damage("voxel/feats/c/0/0", flipped)
     with pytest.raises(StoreError, match=r"copy is not what was published there.*slatprep verify"):
-        open_store(url, copy=True)
+        open_store(published, copy=True)
     assert not list((tmp_path / "cache").rglob("zarr.json"))
 
 
 @pytest.mark.parametrize("part_bytes", [None, 5 * 2**20])
 def test_an_upload_that_arrives_with_another_bit_is_not_published(
-    part_bytes, s3, url, server, undisturbed, tmp_path, monkeypatch, new_clients
+    part_bytes, s3, url, server, tmp_path, monkeypatch, new_clients
 ):
-    store = Path(shutil.copytree(undisturbed[1], tmp_path / "s.zarr"))
-    spoiled = "voxel/feats/c/0/0"
+    store, spoiled = few_files(tmp_path / "s.zarr", "{}"), "zarr.json"
     if part_bytes is not None:  # Large enough for several parts.
         monkeypatch.setattr("slatprep.storage.remote.PART_BYTES", part_bytes)
         monkeypatch.setattr("slatprep.storage.upload.PART_BYTES", part_bytes)
