@@ -60,12 +60,6 @@ class VoxelIndex:
                 )
         return distance, nearest
 
-    def at(self, points: NDArray[np.floating]) -> NDArray[np.int32]:
-        """Return the row (N,) of the voxel whose cell each point (N, 3) lies in, else -1."""
-        cells = np.rint((points + 0.5) * RESOLUTION - 0.5).astype(np.int64)
-        inside = ((cells >= 0) & (cells < RESOLUTION)).all(axis=1)
-        return np.where(inside, self._row[tuple(cells.clip(0, RESOLUTION - 1).T)], np.int32(-1))
-
     def _blocks_near(self, reach: float) -> NDArray[np.bool_]:
         """Return the blocks of cells that may have a voxel within `reach`; others are skipped.
 

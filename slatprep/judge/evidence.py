@@ -114,7 +114,10 @@ def surroundings_of(
     annotation: Annotation,
     tied: NDArray[np.float32],
 ) -> Surroundings:
-    """Measure the surroundings of the positions at which SLAT voxels were looked up."""
+    """Measure the surroundings of the positions at which SLAT voxels were looked up.
+
+    `tied` (N,) comes from `slatprep.judge.measure_ambiguity`.
+    """
     from slatprep.geometry.surroundings import labelled, shares_around
 
     of_voxels, labels = _labels_of(field, annotation)

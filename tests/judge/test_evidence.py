@@ -216,6 +216,17 @@ def test_ties_count_by_how_many_of_them_change_the_class(most, ties, share, monk
         np.testing.assert_allclose(tied, np.where(changes, other * left, 0.0), atol=1e-7)
 
 
+def test_ties_are_compared_without_the_deformation_that_they_lack():
+    field, latents, annotation = column(5)
+    pushed = records.Deformation(np.eye(3, 4), np.zeros(3), 1.0, np.zeros((0, 0, 0, 3)))
+    ties = fitted(None, UPSIDE_DOWN)
+    bent = replace(ties, deformation=pushed)
+    away = replace(annotation, material=np.full_like(annotation.material, 2))
+    np.testing.assert_array_equal(
+        tied_of(field, latents, bent, away), tied_of(field, latents, ties, annotation)
+    )
+
+
 def test_ties_that_change_few_classes_count_as_one():
     # Of 40 voxels in 20 layers four change by a painted layer, by a half each.
     field, latents, annotation = column(2)

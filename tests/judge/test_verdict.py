@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from slatprep.align import align
 from slatprep.geometry.deformation import map_of
 from slatprep.geometry.frames import cube_symmetries, make_transform
 from slatprep.judge import THRESHOLDS, judge, measure_ambiguity, verdict_of
-from slatprep.judge.ambiguity import MOST_VOXELS, compare_labels
+from slatprep.judge.ambiguity import FEWER, MOST_VOXELS, compare_labels
 from slatprep.judge.evidence import FIGURES
 from slatprep.judge.verdict import contradicted, merged
 from slatprep.parameters import AlignParameters, SampleParameters
@@ -325,7 +326,7 @@ def test_a_box_with_a_painted_end_by_hand():
     assert ambiguity.material_share == np.float64(expected)
 
 
-def test_a_full_slat_is_judged_by_some_of_its_ties(monkeypatch):
+def test_a_full_slat_is_judged_by_some_of_its_voxels_and_ties(monkeypatch):
     ball = ((GRID - 31.5) ** 2).sum(axis=-1) < 27**2
     field = field_of(ball, np.where(GRID[..., 2] < 32, 1, 3))
     latents = latents_of(np.argwhere(ball))
@@ -339,6 +340,24 @@ def test_a_full_slat_is_judged_by_some_of_its_ties(monkeypatch):
     assert abs(some[0].material_share - every[0].material_share) < 0.01
     np.testing.assert_allclose(some[0].property_change, every[0].property_change, rtol=0.02)
     assert abs(some[1].mean() - every[1].mean()) < 0.05
+
+
+def test_of_a_full_grid_each_tie_is_looked_at_in_all_layers_and_some_ties_at_all_voxels(
+    monkeypatch,
+):
+    """Classes repeat every eight layers, as would steps of eight in a grid that is in order."""
+    full = np.ones((64, 64, 64), dtype=bool)
+    field = field_of(full, np.where(GRID[..., 2] % 8 == 0, 1, 3))
+    latents, watched = latents_of(np.argwhere(full)), Mock(wraps=sample)
+    annotation = sample(field, latents.centres, PARAMETERS)
+    monkeypatch.setattr("slatprep.judge.ambiguity.sample", watched)
+    # The first tie changes nothing, and the second turns the grid upside down.
+    ties = aligned(np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([-1.0, 1.0, -1.0, 1.0]))
+    some, _ = measure_ambiguity(field, latents, ties, annotation, PARAMETERS)
+    # Layers 0, 8, 16... change with layers 7, 15, 23...: two of eight.
+    assert some.material_share == pytest.approx(0.25, abs=0.01)
+    looked = [len(called.args[1]) for called in watched.call_args_list]
+    assert looked == [64**3, pytest.approx(MOST_VOXELS / FEWER, rel=0.05)]
 
 
 def test_without_classes_a_property_that_changes_notably_counts_by_hand():

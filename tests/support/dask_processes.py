@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from distributed import Client, LocalCluster
 
@@ -67,8 +68,10 @@ sys.addaudithook(refuse)
 
 
 FORKING = """
-from multiprocessing import forkserver
+import os
+from multiprocessing import forkserver, process
 
+process.current_process()._config["tempdir"] = os.environ["SHORT_PATH"]
 forkserver.set_forkserver_preload([
     "distributed", "numba", "s3fs", "scipy.ndimage", "scipy.spatial", "slatprep.align.field",
     "slatprep.pipeline.dataset", "slatprep.workers.dask", "zarr",
@@ -103,6 +106,8 @@ class Processes:
         (folder / "private.py").write_text(PRIVATE)
         (folder / "forking.py").write_text(FORKING)
         self._started: list[subprocess.Popen[bytes]] = []
+        # An address of a socket has at most some hundred characters.
+        self._short = TemporaryDirectory(prefix="dask-", dir="/tmp", ignore_cleanup_errors=True)
 
     def scheduler(self) -> str:
         """Start a scheduler at a free port and return its address."""
@@ -127,7 +132,8 @@ class Processes:
         """Start workers that are soon back when they have been killed."""
         return self.worker(
             address, "--preload-nanny", str(self.folder / "forking.py"), *options,
-            DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD="forkserver", **variables,
+            DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD="forkserver",
+            SHORT_PATH=self._short.name, **variables,
         )  # fmt: skip
 
     def worker_elsewhere(
@@ -151,6 +157,7 @@ class Processes:
         """End all of them."""
         for process in self._started:
             end(process)
+        self._short.cleanup()
 
     def _start(self, *arguments: str, path: str = "", **variables: str) -> subprocess.Popen[bytes]:
         paths = path, str(self.folder), os.environ.get("PYTHONPATH", "")

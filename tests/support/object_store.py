@@ -8,10 +8,10 @@ from contextlib import contextmanager
 # moto's own server finds the service of each request in a listing of its folders, and logs it.
 _SERVER = """
 import sys, threading
-from moto.moto_server.werkzeug_app import MotoRequestHandler, create_backend_app
-from werkzeug.serving import make_server
+from moto.moto_server.werkzeug_app import create_backend_app
+from werkzeug.serving import WSGIRequestHandler, make_server
 
-class Handler(MotoRequestHandler):
+class Handler(WSGIRequestHandler):
     def log_request(self, *_):
         pass
 
@@ -31,7 +31,9 @@ def running() -> Iterator[str]:
     ) as process:  # fmt: skip
         assert process.stdout is not None
         try:
-            yield process.stdout.readline().strip()
+            address = process.stdout.readline().strip()
+            assert address, "the server did not start"
+            yield address
         finally:
             process.kill()
 

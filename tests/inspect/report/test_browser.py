@@ -103,9 +103,9 @@ def drawn(browser: Chrome) -> Callable[[], bytes]:
     """Wait until the 3D view shows something; return what takes a picture of it."""
     script = """const {x, y, width, height} = byId("canvas").getBoundingClientRect();
         return {x: x + scrollX, y: y + scrollY, width, height, scale: 1}"""
-    picture = {"clip": browser.execute_script(script), "optimizeForSpeed": True}
 
     def pixels() -> bytes:
+        picture = {"clip": browser.execute_script(script), "optimizeForSpeed": True}
         taken = browser.execute_cdp_cmd("Page.captureScreenshot", picture)
         return base64.b64decode(taken["data"])
 

@@ -103,8 +103,9 @@ def damage(s3: Any, published: str) -> Iterator[Callable[[str, Change], None]]:
 
     def change(name: str, how: Change) -> None:
         place = f"{version}/{name}"
-        before[place] = s3.cat_file(place) if s3.exists(place) else b""
-        put_there(place, how(before[place]))
+        now = s3.cat_file(place) if s3.exists(place) else b""
+        before.setdefault(place, now)
+        put_there(place, how(now))
 
     yield change
     for place, content in before.items():

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 from s3fs.core import S3FileSystem
-from support.commands import run
 from support.dask_processes import Processes, end, wait_for_workers
 from support.faults import environment as with_fault
 from support.faults import wait_until
@@ -60,15 +59,14 @@ def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_
 ):
     faults = shared[0].folder
     put(another[1], url)
-    config = tmp_path / "dataset.toml"
-    config.write_text(definition(uploaded))
-    command = ["build-store", "--config", str(config), "--out", url, "--scheduler", address]
+    (tmp_path / "dataset.toml").write_text(definition(uploaded))
 
     def build(fault: str = "") -> subprocess.Popen[bytes]:
+        command = ["build-store", "--config", "dataset.toml", "--out", url, "--scheduler", address]
         return subprocess.Popen(
             [sys.executable, "-m", "slatprep", *command],
-            env=with_fault(tmp_path / "faults", fault),
-        )
+            cwd=tmp_path, env=with_fault(tmp_path / "faults", fault),
+        )  # fmt: skip
 
     # While one worker holds an asset, and others have been finished.
     (faults / "hold-c").touch()
@@ -87,7 +85,7 @@ def test_killed_commands_and_workers_with_disks_of_their_own_write_the_bytes_of_
     kills = [faults / f"kill at {step}" for step in ("shard filled", "shard written")]
     for kill in kills:
         kill.touch()
-    run(*command)
+    assert build().wait(900) == 0
     assert not any(kill.exists() for kill in kills)
     assert current(s3, url) == tree(undisturbed[1])
     assert left_behind(s3, url) == set()

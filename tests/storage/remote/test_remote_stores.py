@@ -324,7 +324,7 @@ def test_a_store_that_cannot_be_listed_is_refused_in_words(
 def test_a_build_over_a_store_that_does_not_answer_aligns_nothing_anew(
     published, undisturbed, server, monkeypatch, new_clients, kind
 ):
-    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")  # What is refused is soon asked for again.
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")  # A refused request is not repeated.
     begun: list[str] = []
     inject(monkeypatch, lambda step, name: step == "asset begun" and begun.append(name))
     silent = Faults(chance=1.0, kinds=(kind,), lasting=True, only=r"zarr\.json")
