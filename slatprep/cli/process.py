@@ -99,6 +99,7 @@ def prepare_stop() -> None:
     """
     if sys.platform == "win32":
         return
+    sys.unraisablehook = _not_dropped
     signal.signal(signal.SIGTERM, _stop)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)
@@ -128,8 +129,20 @@ def _stop(number: int, frame: FrameType | None) -> None:
     while frame and len(_asked) < _MOST_AGAIN:
         package = str(frame.f_globals.get("__name__")).partition(".")[0]
         if package in _WAITING or frame.f_code.co_qualname.endswith(_WAITING_CALLS):
-            signal.signal(signal.SIGALRM, _stop)
-            signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+            _ask_again()
             return
         frame = frame.f_back
     stop_if_asked()
+
+
+def _ask_again() -> None:
+    signal.signal(signal.SIGALRM, _stop)
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+
+
+def _not_dropped(raised: sys.UnraisableHookArgs) -> None:
+    """Stop again where Python dropped the stop, as in a callback of an import; tell all else."""
+    if _asked and raised.exc_type is KeyboardInterrupt:
+        _ask_again()
+    else:
+        sys.__unraisablehook__(raised)

@@ -81,7 +81,7 @@ def test_a_signal_at_a_step(step, number, lost, sources, tmp_path):
 
 
 INTERRUPTED = """
-import os, signal, time
+import os, signal, time, weakref
 from slatprep.cli.process import prepare_stop
 
 def interrupted():
@@ -93,6 +93,11 @@ class Gone:
     def __del__(self):
         interrupted()
 
+class Named:
+    pass
+
+named = Named()
+watched = weakref.ref(named, lambda _: interrupted())
 library = {"__name__": "zarr.core.sync", "interrupted": interrupted}
 exec("def call(): interrupted()", library)
 prepare_stop()
@@ -108,6 +113,7 @@ except KeyboardInterrupt:
     ("interrupted()", ["stopped"]),
     # Python drops what a destructor raises, and zarr's thread would go on writing.
     ("Gone()", ["ended", "stopped"]),
+    ("del named", ["stopped"]),  # Python tells what a callback raises, and drops it.
     ("library['call']()", ["ended", "stopped"]),
 ])  # fmt: skip
 def test_a_stop_waits_where_it_would_be_lost(call, printed):
