@@ -44,6 +44,7 @@ TESTS = {
     "align/settle": ["align/test_settle.py"],
     "geometry/deformation": ["geometry/test_frames.py"],
     "align/stretch": ["align/test_deform.py"],
+    "align/residuals": ["align/test_deform.py", "judge/test_evidence.py"],
     "align/pair": ["align/test_pair.py", "align/test_settle.py", "align/test_deform.py"],
     "sample": ["test_sample.py"],
     "judge/ambiguity": ["judge/test_verdict.py"],

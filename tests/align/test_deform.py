@@ -1,11 +1,12 @@
 """A deformation is found where there is one; what is squashed is placed by its features."""
 
 from dataclasses import astuple, replace
-from itertools import product
+from itertools import combinations_with_replacement, product
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 from support.deformed import MOVES, Move, bend, occupancy
@@ -17,6 +18,7 @@ from slatprep.align import align
 from slatprep.align.consensus import degrees_between
 from slatprep.align.deform_solver import OFFSET_PRIOR, PIXIEVERSE_WEIGHT
 from slatprep.align.pose import Poses, Similarity
+from slatprep.align.residuals import STIFFNESS, Residuals
 from slatprep.align.stretch import RIDGE, stretch
 from slatprep.align.surface import Surface, surface_of
 from slatprep.align.warp import Warp, from_nearest, halved, places_of
@@ -231,15 +233,21 @@ def test_without_a_step_the_score_is_the_mean_kernel_of_both_sides(beside):
     assert offset == pose.offset
 
 
-@pytest.mark.parametrize("tau", [1.5, 5.0])
-def test_a_step_is_that_of_least_squares_on_numerical_derivatives(beside, tau):
-    """Of Gauss and Newton, with Geman's and McClure's weights; of samples in the other's box."""
+def shared(beside: Beside) -> Beside:
+    """Return the two sides without the samples that lie outside the other's box."""
     slat, pixie, pose, affine = beside
     there, here = carried(slat, pixie, pose, affine)
     forward, backward = within_box(pixie, there), within_box(slat, here)
     slat = replace(slat, points=slat.points[forward], values=slat.values[forward])
     pixie = replace(pixie, points=pixie.points[backward], values=pixie.values[backward])
     assert min(len(slat.points), len(pixie.points)) > 64  # more than one block of the sums
+    return slat, pixie, pose, affine
+
+
+@pytest.mark.parametrize("tau", [1.5, 5.0])
+def test_a_step_is_that_of_least_squares_on_numerical_derivatives(beside, tau):
+    """Of Gauss and Newton, with Geman's and McClure's weights; of samples in the other's box."""
+    slat, pixie, pose, affine = shared(beside)
     centre = slat.points.mean(axis=0)
     count = len(slat.points) + len(pixie.points)
 
@@ -267,6 +275,71 @@ def test_a_step_is_that_of_least_squares_on_numerical_derivatives(beside, tau):
     found, found_offset, _ = stretched(slat, pixie, pose, affine, tau)
     np.testing.assert_allclose(found, expected, atol=1e-4)
     assert found_offset == pytest.approx(offset, abs=1e-4)
+
+
+@pytest.mark.parametrize("tau", [1.5, 5.0])
+def test_a_step_of_a_lattice_is_that_of_least_squares_by_scipys_splines(beside, tau, monkeypatch):
+    """From a lattice that moves all points alike; the fit sees two thirds of the samples."""
+    monkeypatch.setattr("slatprep.align.residuals.SOLVER_STEPS", 2_000)  # until it is solved
+    slat, pixie, pose, affine = shared(beside)
+    offset, by = 0.2, np.array([0.5, -0.3, 0.2])
+    sides = len(slat.points), len(pixie.points)
+    seen = np.flatnonzero(np.arange(sum(sides)) % 3 > 0)
+    fitted = Residuals(slat, pixie, pose, 1_000)
+    warp = fitted.with_lattice(Warp(affine, offset))
+    warp = warp._replace(coefficients=warp.coefficients + by)
+    found = fitted.fit_lattice(warp, (tau,), seen)
+
+    def at(shift: NDArray[np.float64], added: float) -> NDArray[np.float64]:
+        moved = affine + np.column_stack([np.zeros((3, 3)), by + shift])
+        other = pose._replace(offset=offset + added)
+        return np.concatenate(residuals(slat, pixie, other, moved))[seen]
+
+    tiny = 1e-6 * np.eye(4)
+    slopes = [(at(one[:3], one[3]) - at(-one[:3], -one[3])) / 2e-6 for one in tiny]
+    _, here = carried(slat, pixie, pose, affine + np.column_stack([np.zeros((3, 3)), by]))
+    places = (np.concatenate([slat.points, here])[seen] - warp.origin) / warp.spacing
+    shape = warp.coefficients.shape[:3]
+    axes = [
+        BSpline(np.arange(-3.0, n + 1.0), np.eye(n), 3)(np.clip(x, 0.0, n - 3.0))
+        for n, x in zip(shape, places.T, strict=True)
+    ]
+    splines = np.einsum("mi,mj,mk->mijk", *axes).reshape(len(seen), -1)
+    count = splines.shape[1]
+    jacobian = np.column_stack([*(splines * one[:, None] for one in slopes[:3]), slopes[3]])
+    residual, side = at(np.zeros(3), 0.0), np.repeat([1.0, PIXIEVERSE_WEIGHT], sides)[seen]
+    weight = side / (1.0 + (residual / tau) ** 2) ** 2
+    # The energy of bending: squares of second differences, the mixed ones twice.
+    number = np.eye(count).reshape(*shape, count)
+    energy = sum(
+        (1.0 if a == b else 2.0) * second.T @ second
+        for a, b in combinations_with_replacement(range(3), 2)
+        for second in [np.diff(np.diff(number, axis=a), axis=b).reshape(-1, count)]
+    )
+    held = np.diag([1e-6] * (3 * count) + [OFFSET_PRIOR]) * len(seen)
+    normal = jacobian.T @ (weight[:, None] * jacobian) + held
+    stiff = STIFFNESS * len(seen) / count / warp.spacing**4
+    normal[:-1, :-1] += stiff * np.kron(np.eye(3), energy)
+    right = -jacobian.T @ (weight * residual) - held @ np.append(np.repeat(by, count), offset)
+    step = np.linalg.solve(normal, right)
+    moved = np.moveaxis(step[:-1].reshape(3, *shape), 0, -1)
+    assert min(np.abs(moved).max(), abs(step[-1])) > 0.01
+    np.testing.assert_allclose(found.coefficients - by, moved, atol=2e-4)
+    assert found.offset - offset == pytest.approx(step[-1], abs=1e-4)
+
+
+def test_an_affine_map_is_fitted_to_the_samples_that_are_seen(beside):
+    slat, pixie, pose, affine = beside
+    fitted = Residuals(slat, pixie, pose, 1_000)
+    few = np.arange(0, 90), np.arange(20, 170)
+    found = fitted.fit_affine(Warp(affine, 0.2), (4.0, 2.0), np.append(few[0], 150 + few[1]))
+    slat, pixie = (
+        replace(one, points=one.points[rows], values=one.values[rows])
+        for one, rows in zip((slat, pixie), few, strict=True)
+    )
+    expected, offset, _ = stretched(slat, pixie, pose._replace(offset=0.2), affine, 4.0, 2.0)
+    np.testing.assert_array_equal(found.affine, expected)
+    assert found.offset == offset
 
 
 def test_poses_are_stretched_each_by_itself(beside):
