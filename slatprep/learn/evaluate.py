@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slatprep.errors import ConfigError, InputError, amount, require_one_of
-from slatprep.geometry.voxels import voxels_of
 from slatprep.learn.metrics import (
-    COLUMNS,
     METRICS,
     OURS,
     SPREADS,
@@ -33,7 +31,7 @@ from slatprep.learn.predictions import (
 )
 from slatprep.learn.splits import select_assets
 from slatprep.parameters import PixieverseSource
-from slatprep.readers.adapters import FoundField, find_grids, one_grid
+from slatprep.readers.adapters import find_grids, one_grid
 from slatprep.readers.pixieverse import read_prediction
 from slatprep.readers.splits import Split
 from slatprep.records import (
@@ -45,11 +43,10 @@ from slatprep.records import (
     PROPERTY_COLUMNS,
     SVG_SALT,
     UNANNOTATED,
-    MaterialField,
     Place,
 )
 from slatprep.sample import sample
-from slatprep.store import Store, open_store
+from slatprep.store import Store, StoredAsset, open_store
 
 _BARS = "#AFC3DC"
 
@@ -143,7 +140,7 @@ def evaluate_store(
     missing: list[str] = []
     bad: list[str] = []
     classless: list[str] = []
-    converted = 0
+    converted, held = 0, (store.normalization, store.contents)
     with open_predictions(predictions) if predictions else nullcontext() as read:
         for index in select_assets(store, split, **filters).tolist():
             asset_id, object_id = store.ids[index], str(object_ids[index])
@@ -152,20 +149,24 @@ def evaluate_store(
                 if arrays is None:
                     missing.append(asset_id)
                     continue
-                truth = _Truth(store, index, bool(grids))
-                ours = truth.checked(predictions, arrays) if predictions else None
-                rows = [truth.score(ours)] if ours else []
+                asset = store.asset(index)
+                ours = None
+                if predictions:
+                    where = f"{predictions}/{asset_id}"
+                    ours = check_prediction(where, arrays, asset.coords, *held, asset.valid)
+                rows = [_score(ours, asset)] if ours else []
                 for name, root in grids.items():
-                    rows += truth.score_grid(root, found[name].get(object_id, []), object_id)
+                    path = one_grid(root, found[name].get(object_id, []), object_id, _GRIDS)
+                    rows += _score_grid(path, root, asset)
             except InputError as error:
                 bad.append(str(error))
                 continue
-            scored[index] = [*rows, *(truth.score(one.predict(truth.voxels)) for one in baselines)]
+            scored[index] = [*rows, *(_score(one.predict(vars(asset)), asset) for one in baselines)]
             if ours:
                 converted += ours.converted
                 if ours.material is None and store.contents.classes:
                     classless.append(asset_id)
-            if grids and (truth.grid == UNANNOTATED).any():
+            if grids and (asset.grid_material == UNANNOTATED).any():
                 partly.add(object_id)
     problems = [*(f"{predictions}: no prediction of {name}" for name in missing), *bad]
     if not scored:
@@ -191,52 +192,26 @@ def require_pixieverse(store: Store, others: str) -> None:
         )
 
 
-class _Truth:
-    """The labels of an asset at its SLAT voxels, and on its grid."""
+def _score(prediction: VoxelPrediction, asset: StoredAsset) -> NDArray[np.float64]:
+    """Return the metrics of a prediction for an asset's SLAT voxels."""
+    if not asset.store.contents.classes:
+        prediction = replace(prediction, material=None)
+    return score_asset(prediction, vars(asset))
 
-    def __init__(self, store: Store, index: int, with_grid: bool) -> None:
-        self.store, self.index, self.asset_id = store, index, store.ids[index]
-        self.voxels = store.read(index, (*COLUMNS, "place") if with_grid else COLUMNS)
-        if with_grid:
-            self.grid = np.asarray(store.read_rows("grid/material", index, index + 1)[0])
 
-    def checked(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> VoxelPrediction:
-        """Return a usable prediction for the SLAT's voxels; raise as `check_prediction` does."""
-        coords, labelled = self.voxels["coords"], self.voxels["valid"]
-        ranges, contents = self.store.normalization, self.store.contents
-        source = f"{path}/{self.asset_id}"
-        return check_prediction(source, arrays, coords, ranges, contents, labelled)
-
-    def score(self, prediction: VoxelPrediction) -> NDArray[np.float64]:
-        """Return the metrics of a prediction for the SLAT's voxels."""
-        if not self.store.contents.classes:
-            prediction = replace(prediction, material=None)
-        return score_asset(prediction, self.voxels)
-
-    def score_grid(
-        self, root: Path, found: Sequence[FoundField], object_id: str
-    ) -> Iterator[NDArray[np.float64]]:
-        """Yield the metrics of a predicted grid at the SLAT's voxels, and on the grid itself."""
-        path = one_grid(root, found, object_id, _GRIDS)
-        annotated = self.grid < BACKGROUND
-        ranges = self.store.normalization
-        properties, material = read_prediction(path, root, annotated, ranges)
-        require_normalised(path, properties)
-        # These values are normalised; the lookup copies them without regard to a unit.
-        field = MaterialField(
-            occupancy=annotated,
-            voxels=voxels_of(annotated),
-            material=material,
-            properties=properties.astype(np.float32),
-        )
-        looked_up = sample(field, self.voxels["place"], self.store.about.build.parameters.sample)
-        values = np.where(self.voxels["valid"][:, None], looked_up.properties, 0.0)
-        looked_up_classes = looked_up.material.astype(np.int64)
-        yield self.score(VoxelPrediction(values.astype(np.float64), looked_up_classes))
-        stored = np.asarray(self.store.read_rows("grid/properties", self.index, self.index + 1)[0])
-        own = {"properties": stored[:, annotated].T, "material": self.grid[annotated]}
-        own["valid"] = np.ones(len(properties), dtype=bool)
-        yield score_asset(VoxelPrediction(properties, material.astype(np.int64)), own)
+def _score_grid(path: Place, root: Place, asset: StoredAsset) -> Iterator[NDArray[np.float64]]:
+    """Yield the metrics of a predicted grid at an asset's SLAT voxels, and on the grid itself."""
+    store, stored = asset.store, asset.normalised_field
+    annotated = asset.grid_material < BACKGROUND
+    properties, material = read_prediction(path, root, annotated, store.normalization)
+    require_normalised(path, properties)
+    own = VoxelPrediction(properties, material.astype(np.int64))
+    # These values are normalised; the lookup copies them without regard to a unit.
+    field = replace(stored, material=material, properties=properties.astype(np.float32))
+    looked_up = sample(field, asset.place, store.about.build.parameters.sample)
+    values = np.where(asset.valid[:, None], looked_up.properties, 0.0).astype(np.float64)
+    yield _score(VoxelPrediction(values, looked_up.material.astype(np.int64)), asset)
+    yield score_asset(own, vars(stored) | {"valid": np.ones(len(material), dtype=bool)})
 
 
 def _nothing_scored(
