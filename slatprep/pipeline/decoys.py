@@ -235,21 +235,17 @@ def unrelated_objects(store: Store, grids: Sequence[str]) -> list[str]:
 
     `grids` are digests of the rows' grids, empty if they are unknown.
     """
-    objects, slats = list(map(str, store.column("object_id"))), slat_contents(store)
-    same: dict[str, str] = {}  # the name of each object's relative, itself for the first one
+    from scipy.cluster.hierarchy import DisjointSet
 
-    def first(name: str) -> str:
-        while (other := same.setdefault(name, name)) != name:
-            same[name] = name = same[other]
-        return name
-
-    for contents in (slats, grids):
+    objects = list(map(str, store.column("object_id")))
+    related = DisjointSet(objects)
+    for contents in (slat_contents(store), grids):
         seen: dict[object, str] = {}
         for content, name in zip(contents, objects, strict=True):
             if content:
-                one, other = sorted((first(seen.setdefault(content, name)), first(name)))
-                same[other] = one
-    return list(map(first, objects))
+                related.merge(seen.setdefault(content, name), name)
+    first = {related[name]: name for name in sorted(related, reverse=True)}
+    return [first[related[name]] for name in objects]
 
 
 def _in_turn(rows: Sequence[int], objects: Sequence[str]) -> list[int]:
