@@ -255,21 +255,7 @@ def test_stops_when_validation_gets_no_better(learn_store, tmp_path):
     assert len(summary.history) == 3
 
 
-def test_an_epoch_that_diverged_is_not_the_best(learn_store, tmp_path):
-    out = tmp_path / "diverged"
-    train(learn_store, out, SHORT, stop_after=1)
-    state = torch.load(out / LAST, weights_only=True)
-    state["model"]["regression.bias"].fill_(math.nan)
-    torch.save(state, out / LAST)
-    summary = train(learn_store, out, SHORT)
-    # No epoch after it could be any better.
-    assert [math.isnan(record.val_loss) for record in summary.history] == [False, True]
-    assert (summary.best_epoch, summary.diverged_in) == (0, 1)
-    again = train(learn_store, out, SHORT)
-    assert (len(again.history), again.diverged_in) == (2, 1)
-
-
-def test_the_command_says_that_a_training_diverged_late(learn_store, tmp_path):
+def test_an_epoch_that_diverged_is_not_the_best_and_is_told(learn_store, tmp_path):
     out = tmp_path / "run"
     words = ("train", learn_store, "--out", out, *FAST, "--epochs", 3, "--shares", "0.4,0.3,0.3")
     same = TrainParameters(size="small", epochs=3, learning_rate=0.002, shares=SHARES)
@@ -280,6 +266,10 @@ def test_the_command_says_that_a_training_diverged_late(learn_store, tmp_path):
     said = run(*words).stderr
     assert f"{out}: the training diverged in epoch 1" in said
     assert "the weights of epoch 0 are kept" in said
+    again = train(learn_store, out, same)
+    # No epoch after it could be any better.
+    assert [math.isnan(record.val_loss) for record in again.history] == [False, True]
+    assert (again.best_epoch, again.diverged_in) == (0, 1)
 
 
 def test_a_training_without_an_epoch_to_keep_says_that_it_diverged(learn_store, tmp_path):
