@@ -553,24 +553,6 @@ def test_the_lightest_and_softest_values_are_those_of_the_bounds(tmp_path):
     assert field_at(tmp_path, "physxnet").properties[0].tolist() == [10.0]
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    ({"Poisson's Ratio": 0.6}, "poissons_ratio 0.6 in row 0"), ({"density": 0}, "density 0 in row"),
-])  # fmt: skip
-def test_values_that_no_units_explain_are_named(tmp_path, change, said):
-    stuff = {"density": 0.9, "Young's Modulus (GPa)": 0.01, "Poisson's Ratio": 0.3} | change
-    refused(write_object(tmp_path, [(stuff, cuboid(*ROD))]), said, "parts")
-
-
-def test_a_unit_that_the_file_states_is_its_own(tmp_path):
-    stuff = HANDLE | {"density": "7800 g/cm^3", "Young's Modulus (GPa)": 200}
-    root = write_object(tmp_path, [(stuff, cuboid(*ROD))])
-    refused(
-        root,
-        "expected values that a material has, in GPa and the file's own unit; or set pl",
-        "parts",
-    )
-
-
 def test_parts_and_meshes_belong_together_one_by_one(tmp_path):
     root = write_object(tmp_path, [(HANDLE, cuboid(*ROD)), (HEAD, cuboid((64, 0, 0), (128, 1, 1)))])
     about = root / "finaljson" / "a.json"
@@ -594,8 +576,12 @@ def test_parts_and_meshes_belong_together_one_by_one(tmp_path):
     ("label", "x", r"is no annotation of parts"),
     ("mesh", "v 0 0 0\n", r"is no mesh"),
     ("mesh", None, r"part 0 has no mesh"),
+    # Values that no units explain, and a unit that is the file's own.
+    ("Poisson's Ratio", 0.6, "poissons_ratio 0.6 in row 0"),
+    ("density", 0, "density 0 in row"),
+    ("density", "7800 g/cm^3", "a material has, in GPa and the file's own unit; or set pl"),
 ])  # fmt: skip
-def test_parts_that_are_none_are_named(key, value, said, tmp_path):
+def test_parts_that_are_none_or_of_no_material_are_named(key, value, said, tmp_path):
     root = write_object(tmp_path, [({**HEAD, key: value}, cuboid(*ROD))])
     if key == "mesh":
         mesh = root / "partseg" / "a" / "objs" / "0.obj"
