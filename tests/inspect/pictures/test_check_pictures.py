@@ -306,20 +306,14 @@ def test_that_no_asset_is_chosen_is_no_failure(copy):
 
 
 @pytest.mark.usefixtures("sides")
-def test_an_id_becomes_a_safe_file_name(copy, tmp_path):
-    rewrite(copy, "asset/id", 0, "../ant")
-    store = open_store(copy)
-    (file,), sheet = write_pictures(store, [check_alignment(store, "../ant")], tmp_path / "safe")
-    assert file.parent == tmp_path / "safe" and file.exists() and sheet is None
-
-
-@pytest.mark.usefixtures("sides")
-def test_an_asset_called_sheet_keeps_its_picture(copy, tmp_path):
-    rewrite(copy, "asset/id", 0, "sheet")
-    store = open_store(copy)
+def test_any_id_becomes_a_safe_file_name_of_its_own(copy, tmp_path):
+    rewrite(copy, "asset/id", slice(2), np.array(["../ant", "sheet"], object))
+    store, drawn = open_store(copy), tmp_path / "drawn"
     checks = [check_alignment(store, row) for row in (0, 1)]
-    files, sheet = write_pictures(store, checks, tmp_path / "drawn")
-    assert sheet is not None and {*files, sheet} == {*(tmp_path / "drawn").iterdir()}
+    files, none = write_pictures(store, checks[:1], drawn)
+    assert none is None and {*files} == {*drawn.iterdir()}
+    files, sheet = write_pictures(store, checks, drawn)
+    assert sheet is not None and {*files, sheet} == {*drawn.iterdir()}
     assert len({*files, sheet}) == 3
 
 
