@@ -231,11 +231,6 @@ def test_other_segments_than_the_ids_have_are_found(mixed_build, these):
     assert finding.file == "zarr.json" and "segments" in finding.what
 
 
-def test_a_root_that_is_no_json_is_a_finding(store):
-    (store / "zarr.json").write_text("{")
-    assert [finding.file for finding in found(store)] == ["zarr.json"]
-
-
 def test_metadata_that_differ_from_their_copy_are_found(store):
     edits = {"shape": [7], "data_type": "float32", "dimension_names": ["row"], "fill_value": 1.0}
     arrays = ("fitness", "overlap", "margin", "ambiguity")
