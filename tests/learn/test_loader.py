@@ -71,12 +71,7 @@ def test_filters(learn_store):
         learn.SlatDataset(store, "train", shares=learn.Shares(0.0, 0.0, 1.0))
 
 
-def test_an_asset_without_a_label_is_never_chosen(learn_copy):
-    rewrite(learn_copy, "asset/valid_share", 0, 0.0)
-    assert select_assets(open_store(learn_copy)).tolist() == list(range(1, 9))
-
-
-def test_failed_assets_are_left_out_unless_all_are_asked_for(learn_copy):
+def test_failed_assets_are_left_out_unless_asked_for_and_unlabelled_ones_always(learn_copy):
     for row, verdict in ((1, "failed"), (4, "doubtful"), (7, "failed")):
         rewrite(learn_copy, "asset/verdict", row, verdict)
     dataset = learn.SlatDataset(learn_copy)
@@ -92,6 +87,9 @@ def test_failed_assets_are_left_out_unless_all_are_asked_for(learn_copy):
     left = [int(re.search(r"(\d+) left out", repr(part))[1]) for part in parts]
     assert sum(map(len, parts)) == 7 and sum(left) == 2
     assert next(iter(learn.SlatLoader(learn_copy, 9))).asset_ids == dataset.asset_ids
+    rewrite(learn_copy, "asset/valid_share", 0, 0.0)
+    labelled = select_assets(open_store(learn_copy))
+    assert labelled.tolist() == list(range(1, 9))
 
 
 def test_batch_is_what_zarr_reads(learn_store):
