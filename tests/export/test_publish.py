@@ -117,13 +117,6 @@ def test_a_card_says_what_is_known_and_what_is_not(mixed_build):
     assert "```\n'''me\n```" in linked
 
 
-def test_a_description_in_a_file_is_told_as_json(store, tmp_path):
-    out = tmp_path / "s.json"
-    told = commands.document("describe", store, "--out", out)
-    assert (told["command"], told["path"], told["ok"]) == ("describe", str(out), True)
-    assert json.loads(out.read_text())["@type"] == "sc:Dataset"
-
-
 def test_no_category_is_a_control_character_or_the_row_of_all(copy):
     word = "cup\x1b[2J\x9b\u202e\n"
     rewrite(copy, "asset/category", slice(0, 2), np.array([word, "all"], object))
@@ -220,16 +213,14 @@ def described(store: Store, folder: Path, **stated: str) -> mlcroissant.Dataset:
     return mlcroissant.Dataset(jsonld=path)
 
 
-def test_croissant_is_valid_without_a_warning(store, tmp_path, caplog):
+def test_croissant_is_valid_without_a_warning_and_its_records_are_the_store_s(
+    store, tmp_path, caplog
+):
     dataset = described(open_store(store), tmp_path, **STATED)
     assert dataset.metadata.ctx.issues.report() == ""
     assert caplog.text == ""
     assert dataset.metadata.name == store.stem
     assert {node.id for node in dataset.metadata.distribution} >= {layout.name for layout in ARRAYS}
-
-
-def test_croissant_s_records_are_the_store_s(store, tmp_path):
-    dataset = described(open_store(store), tmp_path)
     group = zarr.open_group(store, mode="r")
     assets = list(dataset.records("assets"))
     assert [row["assets/id"] for row in assets] == list(group["asset/id"][:])
@@ -289,9 +280,10 @@ def test_croissant_describes_figures_that_are_not_numbers(store, tmp_path):
 
 def test_describe_writes_where_the_files_are_found(store, tmp_path):
     out = store.parent / "description" / "croissant.json"
-    commands.run("describe", store, "--out", out, "--name", "mine", "-q")
+    told = commands.document("describe", store, "--out", out, "--name", "mine")
+    assert (told["command"], told["path"], told["ok"]) == ("describe", str(out), True)
     document = json.loads(out.read_text("utf-8"))
-    assert document["name"] == "mine"
+    assert (document["@type"], document["name"]) == ("sc:Dataset", "mine")
     for entry in document["distribution"]:
         if "contentUrl" in entry:
             assert (out.parent / entry["contentUrl"]).is_file()
