@@ -168,10 +168,10 @@ def test_wrong_runs_are_named(learn_store, tmp_path):
     train(learn_store, out, one)
     with pytest.raises(ConfigError, match=r"other parameters \(seed 1 instead of 2\)"):
         train(learn_store, out, dataclasses.replace(one, seed=2))
+    train(learn_store, tmp_path / "other", dataclasses.replace(one, seed=2))
     for name in (LAST, BEST):
-        train(learn_store, tmp_path / name, dataclasses.replace(one, seed=2))
         shutil.copytree(out, tmp_path / f"{name} of another")
-        shutil.copy(tmp_path / name / name, tmp_path / f"{name} of another")
+        shutil.copy(tmp_path / "other" / name, tmp_path / f"{name} of another")
         with pytest.raises(InputError, match=f"{name}: is of another run"):
             train(learn_store, tmp_path / f"{name} of another", one)
     (out / LAST).write_bytes(b"not a checkpoint")
@@ -417,18 +417,26 @@ def test_failed_assets_are_neither_trained_on_nor_exported_unless_asked_for(tmp_
     assert "left out: 1 above the ambiguity 0.125, 1 failed (as " in measured.stderr
 
 
+@pytest.fixture
+def stop(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """End the command where it would train."""
+    ending = Mock(side_effect=ConfigError("far enough"))
+    monkeypatch.setattr("slatprep.learn.train.train", ending)
+    return ending
+
+
+@pytest.mark.usefixtures("stop")
 def test_copies_of_a_slat_in_two_splits_are_named(tmp_path):
     dataset, store = Dataset(tmp_path / "sources").having(*"abcd"), tmp_path / "s.zarr"
     shutil.copy(tmp_path / "sources" / "slat" / "a.npz", tmp_path / "sources" / "slat" / "d.npz")
     build_store(dataset.parameters(), store)
     lists = tmp_path / "lists.json"
     lists.write_text(json.dumps({"train": ["a", "b"], "val": ["c"], "test": ["d"]}))
-    command = ("train", store, "--out", tmp_path / "run", *FAST, "--epochs", "1")
-    told = run(*command, "--split-by", lists).stderr
+    command = ("train", store, "--out", tmp_path / "run", "--split-by", lists)
+    told = refused(*command)
     assert "1 SLAT with copies in other splits, under other ids (a = d)" in told
     lists.write_text(json.dumps({"train": ["a", "d"], "val": ["c"], "test": ["b"]}))
-    again = run(*command[:3], tmp_path / "again", *command[4:], "--split-by", lists).stderr
-    assert "with copies" not in again
+    assert "with copies" not in refused(*command)
 
 
 def test_a_run_keeps_its_lists_and_evaluate_takes_them(learn_store, tmp_path):
@@ -525,10 +533,8 @@ def test_the_last_weights_need_no_validation(learn_store, tmp_path):
      (("--steps", "1", "--accumulate", "2"), 1, 2), ((), 2000, 4)],
 )  # fmt: skip
 def test_the_paper_s_preset_is_what_is_not_given(
-    words, steps, accumulate, learn_store, tmp_path, monkeypatch
+    words, steps, accumulate, learn_store, tmp_path, stop
 ):
-    stop = Mock(side_effect=ConfigError("far enough"))
-    monkeypatch.setattr("slatprep.learn.train.train", stop)
     told = refused("train", learn_store, "--out", tmp_path / "run", "--preset", "paper", *words)
     assert "far enough" in told
     _, _, chosen = stop.call_args.args
