@@ -160,12 +160,12 @@ class UnknownAssetError(StoreError, ConfigError):
 
 
 @contextmanager
-def needing(what: str, extra: str, kind: type[SlatprepError] = ConfigError) -> Iterator[None]:
-    """Raise an error that says how to install a package if its import in the block fails."""
+def needing(what: str, extra: str) -> Iterator[None]:
+    """Raise a ConfigError that says how to install a package if its import in the block fails."""
     try:
         yield
     except ImportError as error:
         missing = isinstance(error, ModuleNotFoundError)
         package = f"the package {error.name}" if missing else f"a package that fails ({error})"
         way = f"install it with `pip install 'slatprep[{extra}]'`"
-        raise kind(f"{what} {package}; {way}") from error
+        raise ConfigError(f"{what} {package}; {way}") from error

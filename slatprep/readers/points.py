@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import InputError, SlatprepError, needing
+from slatprep.errors import InputError, needing
 from slatprep.readers.files import refusing
 from slatprep.records import Place
 
@@ -28,9 +28,9 @@ def ply_points(data: bytes, where: str | Place) -> tuple[NDArray[Any], tuple[str
     """Return the vertices of a PLY, structured (N,), and the comments of its header.
 
     Vertices have at least numbers ``x``, ``y`` and ``z``. InputError if the file has none,
-    SlatprepError if plyfile is not installed.
+    ConfigError if plyfile is not installed.
     """
-    with needing("reading a PLY needs", "simulate", SlatprepError):
+    with needing("reading a PLY needs", "simulate"):
         import plyfile
 
     def read(ply: bytes) -> Any:

@@ -1,6 +1,7 @@
 """Materials reach particles: against brute force, and read back by other programs."""
 
 import shutil
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -190,6 +191,13 @@ def test_gaussians_of_another_tool_are_told_apart(names, reach, sign, store, tru
     else:
         told = commands.refused("transfer", *words)
         assert sign in told and "half of them" in told
+
+
+def test_a_reader_that_is_not_installed_is_wrong_use(store, tmp_path, monkeypatch):
+    write_points(tmp_path / "g.ply", np.zeros((1, 3)))
+    monkeypatch.setitem(sys.modules, "plyfile", None)  # as an import finds what is missing
+    words = "--store", store, "--asset", "cup", "--out", tmp_path / "m.ply"
+    assert "pip install 'slatprep[simulate]'" in run_wrong(tmp_path / "g.ply", *words)
 
 
 def test_what_slatprep_wrote_says_its_frame(store, true_parts, tmp_path):
