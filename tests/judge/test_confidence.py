@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.special import expit
 from support.demos import Case, made_cases
 from support.shapes import GRID, chair, field_of, surface_latents
@@ -17,7 +18,7 @@ from slatprep.inspect.verify.assets import roundings
 from slatprep.judge import THRESHOLDS, evidence, voxel_confidence
 from slatprep.judge.calibration import PLACEMENT, SAME_OBJECT, VOXEL
 from slatprep.judge.confidence import causes_of_doubt
-from slatprep.judge.decoys import FOLDS, LEARNED, ErrorRates, error_rates
+from slatprep.judge.decoys import FOLDS, LEARNED, ErrorRates, _fit, error_rates
 from slatprep.judge.model import FLOOR
 from slatprep.judge.verdict import LEAST_TARGETS
 from slatprep.judge.witness import fold_of
@@ -215,6 +216,32 @@ def test_a_figure_counts_for_a_dataset_if_its_decoys_are_worse_in_it(name):
         assert found.refitted
         assert (found.scores[0] > found.scores[1]) == counts
         assert counts or found.scores[0] == found.scores[1]
+
+
+@pytest.mark.parametrize("counts", [(30, 90), (80, 25)])
+def test_a_fit_to_decoys_is_the_minimum_that_another_solver_finds(counts):
+    """Each side counts one half; three samples of the rarer side hold the shipped model's weight.
+
+    The third figure speaks against the truth, so its weight is held at 0.
+    """
+    rng = np.random.default_rng(4)
+    sides = [rng.normal(0.6 * sign, 1.0, (n, 3)) for n, sign in zip(counts, (1, -1), strict=True)]
+    for side in sides:
+        side[:, 2] *= -1.0
+
+    def loss(weights: np.ndarray) -> float:
+        odds = (side @ weights[:3] + weights[3] for side in sides)
+        misfit = sum(
+            0.5 * np.log1p(np.exp(-s * o)).mean() for s, o in zip((1, -1), odds, strict=True)
+        )
+        off = (weights[0] - 1.0) ** 2 + weights[1] ** 2 + weights[2] ** 2 + 0.1 * weights[3] ** 2
+        return float(misfit + 0.5 * 3.0 / min(counts) * off)
+
+    bounds = [(0.0, None)] * 3 + [(None, None)]
+    best = minimize(loss, np.ones(4), method="SLSQP", bounds=bounds, options={"ftol": 1e-14})
+    found = _fit(*sides)
+    assert best.x[2] == 0.0 == found[2]
+    np.testing.assert_allclose(found, best.x, atol=2e-3)
 
 
 def test_an_object_is_scored_by_a_fit_that_saw_neither_its_targets_nor_its_decoys():
