@@ -19,7 +19,7 @@ from slatprep.align.pose import Similarity
 from slatprep.align.quality import measure_quality
 from slatprep.align.settle import refit, take
 from slatprep.align.surface import surface_of
-from slatprep.geometry.frames import displacement, make_transform
+from slatprep.geometry.frames import displacement, make_transform, split_transform
 from slatprep.geometry.voxels import boundary, voxels_of
 from slatprep.judge import THRESHOLDS
 from slatprep.parameters import AlignParameters
@@ -63,6 +63,11 @@ def test_an_object_on_ground_is_placed_as_without(thickness, degrees, radius, sc
     normal = Rotation.from_euler("x", degrees, degrees=True).apply([0.0, 0.0, 1.0])
     assert np.degrees(np.arccos(found.ground.normal @ normal)) < 1.5
     assert judged(field, latents, found).verdict is records.Verdict.GOOD
+    # The same heading is fitted without the ground too, and fits as well.
+    rotation, _, _ = split_transform(found.transform)
+    again, lead = engine.fitted_near(found, rotation, field, latents, DEFAULT)
+    assert displacement(again.transform, found.transform, latents.centres) < 0.2
+    assert abs(lead) < 0.01
 
 
 def test_the_top_of_a_slab_is_found():
