@@ -51,15 +51,27 @@ def demo_cases(tmp_path_factory):
     return cache(lambda level: made_cases(tmp_path_factory.mktemp("level"), 14, 11, level))
 
 
+def boxes(*half: float) -> tuple[MaterialField, StructuredLatents]:
+    """Return a box, and the surface of one that is a little larger and off the lattice.
+
+    Of placements that tie, the one that is chosen is then not the one that scores most.
+    """
+    solid, larger = (
+        (abs(GRID - 31.5 - np.array(at)) < size * np.array(half)).all(axis=-1)
+        for size, at in ((1.0, (0.0, 0.0, 0.0)), (1.01, (0.4, 0.2, 0.3)))
+    )
+    return field_of(solid), surface_latents(larger)
+
+
+def test_no_margin_is_below_zero_as_only_that_of_a_stated_frame_is():
+    alignment = align(*boxes(20, 20, 20), DEFAULT)
+    assert len(alignment.placements) == 23
+    assert alignment.margin == 0.0
+
+
 @pytest.mark.parametrize("half", [(24, 12, 8), (22, 13, 6)])
 def test_the_ties_of_a_box_are_its_three_half_turns(half):
-    def box(size: np.ndarray, at: tuple[float, float, float]) -> np.ndarray:
-        return (abs(GRID - 31.5 - np.array(at)) < size).all(axis=-1)
-
-    # A little larger and off the lattice: the one that is chosen is not the one that scores most.
-    larger = box(1.01 * np.array(half), (0.4, 0.2, 0.3))
-    latents = latents_of(voxels_of(boundary(larger)))
-    alignment = align(field_of(box(np.array(half), (0.0, 0.0, 0.0))), latents, DEFAULT)
+    alignment = align(*boxes(*half), DEFAULT)
     chosen, _, _ = split_transform(alignment.transform)
     turns = [split_transform(p.transform)[0] @ chosen.T for p in alignment.placements]
     assert len(turns) == 3
