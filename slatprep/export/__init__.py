@@ -27,7 +27,7 @@ from slatprep.records import USABLE, Place, words_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_outside
 from slatprep.workers import Progress
-from slatprep.workers.local import run_unordered
+from slatprep.workers.local import require_workers, run_unordered
 
 __all__ = ["FORMATS", "ExportOptions", "ExportSummary", "export_store"]
 
@@ -117,13 +117,14 @@ def export_store(
     Raises
     ------
     ConfigError
-        If no asset is left, an id is unknown, or `out` lies in a store or holds something
-        that is not an export of this format.
+        If no asset is left, an id is unknown, `jobs` is below 1, or `out` lies in a store or holds
+        something that is not an export of this format.
     StoreError
         If the store cannot be read.
     """
     begin = time.perf_counter()
     require_one_of("format", format, FORMATS)
+    require_workers(jobs)
     options, opened, out = options or ExportOptions(), open_store(store), Path(out)
     require_outside(out)
     assets = words_of(assets)

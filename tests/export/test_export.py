@@ -140,6 +140,8 @@ def test_bytes_repeat_whatever_the_jobs(format, store, tmp_path):
     export_store(store, tmp_path / "one" / "export", format, options=options)
     assert bytes_of(tmp_path / "one" / "export") == one
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["export"]
+    with pytest.raises(ConfigError, match="jobs is 0; expected a whole number from 1"):
+        export_store(store, tmp_path / "one" / "export", format, jobs=0)
 
 
 @pytest.mark.parametrize("format", KINDS)
