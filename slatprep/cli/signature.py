@@ -216,7 +216,10 @@ def require_apart(command: click.Command, given: Mapping[str, Any]) -> None:
     written = {
         parameter.name: (parameter, Path(given[parameter.name]))
         for parameter in command.params
-        if isinstance(parameter.type, NewPath) and given.get(str(parameter.name)) is not None
+        if isinstance(parameter.type, NewPath)
+        and given.get(str(parameter.name)) is not None
+        # Where the option allows it, the word none is no path.
+        and not (str(parameter.metavar).endswith("|none") and given[parameter.name] == Path("none"))
     }
     if not written:
         return

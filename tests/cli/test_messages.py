@@ -272,6 +272,8 @@ def test_documents_begin_alike_and_say_which_store_as_it_was_typed(store, monkey
         assert (one["command"], one["ok"]) == (command, True)
         assert one.get("store", one.get("a")) == one.get("store", one.get("b")) == typed
     assert run("info", store).stdout.startswith(f"Store {store}\n")
+    monkeypatch.chdir(store)  # where a picture called none could not be written
+    assert document("check-alignment", *words[:4], ".")["assets"][0]["picture"] is None
     files = sum(file.is_file() for file in store.rglob("*"))
     assert told["info"]["files"] == told["verify"]["files"] == files
 
