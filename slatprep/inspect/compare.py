@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import StoreError
+from slatprep.errors import ConfigError, StoreError
 from slatprep.geometry.frames import displacement, voxel_centres
 from slatprep.geometry.voxels import flat_index
 from slatprep.normalize import denormalize_properties
@@ -178,9 +178,13 @@ def compare_stores(
 
     Raises
     ------
+    ConfigError
+        If `worst` is negative.
     StoreError
         If a store cannot be read.
     """
+    if worst is not None and worst < 0:
+        raise ConfigError(f"worst is {worst}; expected 0 or more")
     a, b = open_store(a), open_store(b)
     rows_b = {asset_id: row for row, asset_id in enumerate(b.ids)}
     rows = [(row, rows_b[name]) for row, name in enumerate(a.ids) if name in rows_b]
@@ -189,7 +193,9 @@ def compare_stores(
     only_b = tuple(sorted(rows_b.keys() - set(a.ids)))
     total = _Sum()
     changes = total.of(_changes(a, b, rows, jobs, progress))
-    kept = heapq.nlargest(len(rows) if worst is None else worst, changes, key=_how_much)
+    most = len(rows) if worst is None else worst
+    # The totals are of all changes, and heapq would take none if it kept none.
+    kept = heapq.nlargest(max(most, 1), changes, key=_how_much)[:most]
     moved = total.moved or [math.nan]
     return StoreDifference(
         a=a.path,

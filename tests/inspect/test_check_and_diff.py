@@ -12,7 +12,7 @@ from support.commands import document, run
 from support.made_store import rewrite
 from support.synthetic import Dataset, MakeDataset, make_asset
 
-from slatprep import StoreError, compare_stores, open_store, subset_store
+from slatprep import ConfigError, StoreError, compare_stores, open_store, subset_store
 from slatprep.geometry.frames import displacement, make_transform
 from slatprep.inspect.check import AlignmentCheck, check_alignment, choose_assets
 from slatprep.inspect.overview import overview_of
@@ -248,3 +248,13 @@ def test_figures_are_medians_over_assets_and_shares_over_voxels(copy):
     files = [file for file in copy.rglob("*") if file.is_file()]
     assert overview.files == len(files)
     assert overview.size == sum(file.stat().st_size for file in files)
+
+
+def test_totals_do_not_depend_on_how_many_changes_are_listed(mixed_build, copy):
+    rewrite(copy, "asset/fitness", 0, 0.25)
+    every = compare_stores(mixed_build.store, copy)
+    none = compare_stores(mixed_build.store, copy, worst=0)
+    assert (none.changed, none.voxels, none.what) == (1, every.voxels, {"columns": 1})
+    assert not none.worst and not none.same
+    with pytest.raises(ConfigError, match="worst is -1; expected 0 or more"):
+        compare_stores(mixed_build.store, copy, worst=-1)
