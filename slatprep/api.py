@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slatprep.align import align
 from slatprep.geometry.deformation import PlaceMap, map_of
-from slatprep.geometry.voxels import occupancy_of, voxels_of
+from slatprep.geometry.voxels import flat_index, occupancy_of, voxels_of
 from slatprep.parameters import AlignParameters, SampleParameters
 from slatprep.parameters.files import checked
 from slatprep.records import (
@@ -127,7 +127,7 @@ def annotate_voxels(
     ------
     ValueError
         If `coords` are no voxels, `transform` is no similarity, or the field's voxels, classes
-        and properties do not fit together.
+        and properties do not fit together, or are not those of annotated voxels, each once.
     ConfigError
         If a parameter makes no sense.
     """
@@ -154,7 +154,14 @@ def _checked(field: MaterialField) -> MaterialField:
         raise ValueError(
             f"field.material has values that are no classes; expected 0 to {UNANNOTATED - 1}"
         )
+    if len(np.unique(flat_index(voxels))) < len(voxels):
+        raise ValueError("field.voxels has a voxel twice; expected each annotated voxel once")
     properties = properties.astype(np.float32)
+    for of, values in zip(field.table, properties.T, strict=True):
+        wrong = values[~(np.isfinite(values) & ((values > 0) | (not of.log10)))]
+        if wrong.size:
+            expected = "numbers above 0" if of.log10 else "finite numbers"
+            raise ValueError(f"field.properties has {of.name} {wrong[0]:g}; expected {expected}")
     return replace(field, voxels=voxels, material=material.astype(np.uint8), properties=properties)
 
 

@@ -119,6 +119,18 @@ def test_a_field_whose_arrays_do_not_fit_is_refused_in_words(name, values, said)
         slatprep.annotate_voxels(replace(field, **{name: array}), asset.coords, QUARTER_TURN)
 
 
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda f: {"voxels": f.voxels[[1, *range(1, len(f.voxels))]]}, r"field\.voxels has .* twice"),
+    (lambda f: {"properties": f.properties * np.nan}, r"field\.properties has youngs_modulus nan"),
+    (lambda f: {"properties": -f.properties}, r"field\.properties has youngs_modulus -"),
+])  # fmt: skip
+def test_a_field_that_no_reader_gives_is_refused_in_words(change, said):
+    asset = make_asset(2)
+    field = field_of(asset)
+    with pytest.raises(ValueError, match=said):
+        slatprep.annotate_voxels(replace(field, **change(field)), asset.coords, QUARTER_TURN)
+
+
 @pytest.mark.parametrize("dtype", [">i8", ">f4", np.int8, object])
 def test_arrays_of_a_field_may_have_any_type_of_number_and_may_change(dtype):
     asset = make_asset(2)
@@ -127,7 +139,7 @@ def test_arrays_of_a_field_may_have_any_type_of_number_and_may_change(dtype):
     arrays = {name: getattr(field, name) for name in ("voxels", "material")}
     given = replace(field, **{name: array.astype(dtype) for name, array in arrays.items()})
     other = given.voxels.copy()
-    given.voxels[:] = 0
+    given.voxels[:] = other[::-1]
     slatprep.annotate_voxels(given, asset.coords, QUARTER_TURN)
     given.voxels[:] = other
     found = slatprep.annotate_voxels(given, asset.coords, QUARTER_TURN)
