@@ -114,9 +114,9 @@ def evaluate_store(
     A grid is measured twice. Its own voxels are measured by Pixie's protocol (vlongle/pixie,
     ``inference_combined.py``): squared errors in normalised space and class accuracy, means over
     the object's annotated voxels, then over objects. A voxel predicted as background has the wrong
-    class, but its properties count, and no prediction is clipped. At the SLAT's voxels, the grid's
-    values are sampled as the store's labels were, at the stored places. The grid that the labels
-    were made from therefore has no error there.
+    class, but its properties count. Only a grid in SI units is clipped. At the SLAT's voxels, the
+    grid's values are sampled as the store's labels were, at the stored places. The grid that the
+    labels were made from therefore has no error there.
 
     `predictions` is read by `slatprep.learn.predictions.open_predictions`, a file of `grids` by
     `slatprep.readers.pixieverse.read_prediction`: ``<object id>/sample_<k>_pred.npy``, ``<object
