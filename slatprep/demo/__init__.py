@@ -8,11 +8,12 @@
 from __future__ import annotations
 
 import json
+import operator
 from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from slatprep.demo import write
 from slatprep.demo.asset import DemoAsset, make_asset
@@ -26,7 +27,8 @@ from slatprep.demo.sources import (
     write_description,
     write_json,
 )
-from slatprep.errors import ConfigError
+from slatprep.errors import ConfigError, require_one_of
+from slatprep.storage.place import local_path_of
 from slatprep.workers import Progress, counted
 from slatprep.workers.local import require_workers, run_unordered
 
@@ -144,13 +146,16 @@ def make_demo(
         If an argument is not allowed, or the folder holds anything but the same demo.
     """
     usual = (0,) if source in ONE_FRAME else SAME_SHAPE_LEVELS
+    # Numbers of numpy are as good, but JSON does not hold them.
+    assets, seed, views, samples = map(operator.index, (assets, seed, views, samples))
+    levels = usual if levels is None else tuple(map(operator.index, levels))
     recipe = _Recipe(
-        assets, seed, usual if levels is None else tuple(levels), views, latents, habitual_share,
+        assets, seed, levels, views, latents, float(habitual_share),
         source, encoder, slat_form, slat_names, results, samples,
     )  # fmt: skip
     _check(recipe)
     require_workers(jobs)
-    root = Path(directory)
+    root = local_path_of(directory)
     _claim(root, recipe)
     tasks = ((root, recipe, index) for index in range(assets))
     # A single file for all assets allows only one writer.
@@ -170,6 +175,14 @@ def make_demo(
 
 
 def _check(recipe: _Recipe) -> None:
+    for name, words in {
+        "latents": LatentKind,
+        "source": Source,
+        "encoder": Encoder,
+        "slat_form": write.SlatForm,
+        "slat_names": write.SlatNames,
+    }.items():
+        require_one_of(name, getattr(recipe, name), get_args(words))
     for name, allowed in {
         "assets": recipe.assets >= 1,
         "seed": recipe.seed >= 0,

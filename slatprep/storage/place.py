@@ -94,6 +94,14 @@ def place_of(text: str | Place, folder: Path | None = None) -> Place:
     return path.resolve() if path.name in ("", "..") else path
 
 
+def local_path_of(text: str | Place) -> Path:
+    """Return a path of the local disk, as `place_of` does; ConfigError for any other place."""
+    place = place_of(text)
+    if not isinstance(place, Path):
+        raise ConfigError(f"{place}: expected a path of the local disk")
+    return place
+
+
 def is_place(value: object) -> TypeGuard[Path | RemotePlace | ArchivePlace]:
     """Return whether a value is a path, a URL from `place_of`, or a place in archives."""
     return isinstance(value, Path | RemotePlace | ArchivePlace)

@@ -326,3 +326,30 @@ def test_a_wrong_frame_of_any_source_is_caught(tmp_path, source):
     assert store.ids == [truth.stem for truth in truths]
     assert set(store.column("engine")) == {"known"}
     assert store.column("verdict").tolist() == ["good", "failed"]
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"source": "vomps"}, "source is 'vomps'; expected one of pixieverse, "),
+    ({"latents": "noise"}, "latents is 'noise'; expected one of placeholder, material"),
+    ({"encoder": "dino"}, "encoder is 'dino'; expected one of trellis, "),
+    ({"slat_form": "zip"}, "slat_form is 'zip'; expected one of npz, "),
+    ({"slat_names": "sha"}, "slat_names is 'sha'; expected one of id, sha256"),
+])  # fmt: skip
+def test_words_that_name_nothing_are_refused(given, said, tmp_path):
+    with pytest.raises(ConfigError, match=said):
+        make_demo(tmp_path / "demo", 1, 0, **given)
+    assert not any(tmp_path.iterdir())
+
+
+def test_numbers_of_numpy_make_the_same_demo(tmp_path):
+    given = {"levels": np.array([1]), "habitual_share": np.float32(0.5)}
+    make_demo(tmp_path / "a", np.int64(1), np.int64(2), **given)
+    make_demo(tmp_path / "b", 1, 2, levels=(1,), habitual_share=0.5)
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+
+
+def test_a_demo_at_a_url_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="s3://bucket/x: expected a path of the local disk"):
+        make_demo("s3://bucket/x", 1, 0)
+    assert not any(tmp_path.iterdir())
