@@ -24,6 +24,7 @@ from slatprep.export.formats import (
     describe_columns,
 )
 from slatprep.records import USABLE, Place, words_of
+from slatprep.storage.place import local_path_of
 from slatprep.store import Store, open_store
 from slatprep.store.reader import require_outside
 from slatprep.workers import Progress
@@ -117,15 +118,15 @@ def export_store(
     Raises
     ------
     ConfigError
-        If no asset is left, an id is unknown, `jobs` is below 1, or `out` lies in a store or holds
-        something that is not an export of this format.
+        If no asset is left, an id is unknown, `jobs` is below 1, or `out` is a URL, lies in a store
+        or holds something that is not an export of this format.
     StoreError
         If the store cannot be read.
     """
     begin = time.perf_counter()
     require_one_of("format", format, FORMATS)
     require_workers(jobs)
-    options, opened, out = options or ExportOptions(), open_store(store), Path(out)
+    options, opened, out = options or ExportOptions(), open_store(store), local_path_of(out)
     require_outside(out)
     assets = words_of(assets)
     if verdicts is None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError, tally
+from slatprep.errors import ConfigError, StoreError, require_one_of, tally
 from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.frames import voxel_centres
 from slatprep.records import BACKGROUND, MATERIAL_CLASSES, PROPERTY_COLUMNS, words_of
@@ -52,7 +52,8 @@ def choose_ids(store: Store, assets: Sequence[str | int], verdicts: Sequence[str
 
     Raises ConfigError if an id or a verdict is unknown, or no asset is left.
     """
-    verdicts, wanted = words_of(verdicts), store.having(verdicts)
+    verdicts = words_of(verdicts)
+    wanted = store.having(verdicts)
     named = sorted({store.match(name) for name in words_of(assets)})
     rows = named or range(len(store))
     chosen = sorted(store.ids[row] for row in rows if wanted[row])
@@ -134,7 +135,7 @@ def annotated_points(asset: StoredAsset, points: Points) -> AnnotatedPoints:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of some formats.
+    """Options of some formats; ConfigError if one makes no sense.
 
     Attributes
     ----------
@@ -160,6 +161,13 @@ class ExportOptions:
     latent_model: str | None = None
     size: float = 1.0
     materials: int = 64
+
+    def __post_init__(self) -> None:
+        if self.points is not None:
+            require_one_of("points", self.points, get_args(Points))
+        require_one_of("frame", self.frame, get_args(Frame))
+        if not (isinstance(self.shard_size, int | np.integer) and self.shard_size >= 1):
+            raise ConfigError(f"shard_size is {self.shard_size}; expected a whole number from 1")
 
 
 @dataclass(frozen=True)

@@ -473,3 +473,28 @@ def test_an_export_looks_what_it_replaces_once_it_has_the_lock(tmp_path, monkeyp
     monkeypatch.setattr(target, "scratch_beside", late)
     export("b")
     assert sorted(path.name for path in out.iterdir()) == ["b", "index.json"]
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"points": "grids"}, "points is 'grids'; expected one of slat, grid"),
+    ({"frame": "world"}, "frame is 'world'; expected one of slat, pixieverse"),
+    ({"shard_size": 0}, "shard_size is 0; expected a whole number from 1"),
+    ({"shard_size": -1}, "shard_size is -1; expected a whole number from 1"),
+    ({"shard_size": 2.5}, "shard_size is 2.5; expected a whole number from 1"),
+])  # fmt: skip
+def test_options_that_make_no_sense_are_refused(given, said):
+    with pytest.raises(ConfigError, match=said):
+        ExportOptions(**given)
+
+
+def test_verdicts_may_come_from_a_generator(store, tmp_path):
+    with pytest.raises(ConfigError, match="no asset has the verdict failed"):
+        export_store(store, tmp_path / "x", "npz", verdicts=(one for one in ["failed"]))
+
+
+def test_an_export_to_a_url_is_refused(store, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="s3://bucket/x: expected a path of the local disk"):
+        export_store(store, "s3://bucket/x", "npz")
+    assert export_store(store, f"file://{tmp_path}/x", "npz").path == tmp_path / "x"
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
