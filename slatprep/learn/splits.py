@@ -11,12 +11,13 @@ from slatprep.errors import require_one_of
 from slatprep.readers.splits import HASH, SPLITS, Assignment, Split, assign_splits
 from slatprep.readers.splits import Shares as Shares
 from slatprep.readers.splits import split_of as split_of
+from slatprep.records import Place
 from slatprep.store import Store
 
 
 def assign_store(
     store: Store,
-    by: str = HASH,
+    by: str | Place = HASH,
     shares: Shares = Shares(),  # noqa: B008 (immutable)
 ) -> Assignment:
     """Return the split of every object of a store that has a valid voxel.
@@ -27,7 +28,7 @@ def assign_store(
     rows = np.flatnonzero(store.column("valid_share") > 0).tolist()
     named = [tuple(str(column[row]) for column in columns) for row in rows]
     objects = {object_id: category for _, object_id, category in named}
-    return assign_splits(by, objects, shares, {asset: name for asset, name, _ in named})
+    return assign_splits(str(by), objects, shares, {asset: name for asset, name, _ in named})
 
 
 def select_assets(
