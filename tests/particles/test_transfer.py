@@ -15,7 +15,7 @@ from support.synthetic import Dataset
 
 from slatprep.errors import ConfigError, InputError
 from slatprep.export import ExportOptions, export_store
-from slatprep.particles.fields import VoxelField, predicted_field
+from slatprep.particles.fields import VoxelField, predicted_field, stored_field
 from slatprep.particles.read import read_particles
 from slatprep.particles.transfer import transfer
 from slatprep.records import Normalization
@@ -255,6 +255,8 @@ def test_nearest_is_nearest_by_brute_force(side):
 
 
 def test_grid_reaches_inside_the_object(store, mixed, tmp_path):
+    with pytest.raises(ConfigError, match="points is 'grids'; expected one of slat, grid"):
+        stored_field(open_store(store), "cup", points="grids")  # type: ignore[arg-type]
     grid = mixed.assets["cup"].grid
     solid = np.argwhere(grid[..., 3] != 7)
     turned = np.stack([63 - solid[:, 1], solid[:, 0], solid[:, 2]], axis=1)  # the quarter turn
