@@ -180,7 +180,7 @@ def allowed_decoys(assets: int) -> int:
 
 
 def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.float64]]:
-    """Read the records' keys by id, digests of grids by row, and evidence (A, F)."""
+    """Read the keys of first passes by id, digests of grids by row, and evidence (A, F)."""
     records = StoredRecords(store)
     keys: dict[str, str] = {}
     grids: list[str] = []
@@ -189,7 +189,8 @@ def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.fl
         # Checking a whole record takes a millisecond, and only these entries are needed.
         try:
             record = orjson.loads(records.text(row))
-            keys[asset_id] = str(record["key"])
+            # A pass that places an asset anew, or only counts others anew, changes no decoy.
+            keys[asset_id] = str((record.get("first_pass") or record)["key"])
             own = (file["sha256"] for file in record["sources"] if file["role"] == "grid")
             grids.append(next(own, ""))
             evidence.append(np.array(record["judgement"]["evidence"], dtype=np.float64))

@@ -35,9 +35,9 @@ _MAX_BYTES = 64 * 2**20
 class Decoy:
     """An asset's grid and another asset's SLAT, both by their ids.
 
-    `keys` are the keys of the two assets. `verdict` is the verdict on the decoy's alignment, as for
-    an asset. `evidence` has the alignment's `slatprep.judge.evidence.FIGURES`; it is empty before
-    the decoy is aligned.
+    `keys` are the keys of the two assets, without passes. `verdict` is the verdict on the decoy's
+    alignment, as for an asset. `evidence` has the alignment's `slatprep.judge.evidence.FIGURES`; it
+    is empty before the decoy is aligned.
     """
 
     grid: str
@@ -193,7 +193,7 @@ def errors_of(store: Store) -> MeasuredErrors | None:
 
     def key_of(asset_id: str) -> str:
         with suppress(StoreError):  # It is not there, or damaged.
-            return records.of(asset_id).key
+            return records.of(asset_id).of_first_pass().key
         return ""
 
     still = any(one.keys == (key_of(one.grid), key_of(one.slat)) for one in measured.decoys)

@@ -17,10 +17,13 @@ from slatprep.inspect.verify import verify_store
 from slatprep.judge import THRESHOLDS
 from slatprep.parameters import BuildParameters, ConsensusParameters, WitnessParameters
 from slatprep.pipeline.dataset import build_store, plan_build
+from slatprep.pipeline.decoys import measure_errors
+from slatprep.pipeline.measured import told_of
 from slatprep.pipeline.notices import shared_rotation
 from slatprep.pipeline.passes import apply_consensus
 from slatprep.pipeline.plan import Crew
 from slatprep.pipeline.rows import NextStore, Row, SourceStore
+from slatprep.store.records import ERRORS, manifests_of
 
 SETTLED = ConsensusParameters(settle=True)
 HEARD = WitnessParameters(settle=True)
@@ -92,6 +95,21 @@ def test_what_was_settled_is_recorded_and_can_be_undone(agreed):
         assert entry["placements"][0]["transform"] == alone[asset_id]["alignment"]["transform"]
         assert together[asset_id]["first_pass"]["alignment"] == alone[asset_id]["alignment"]
     assert not any(record["alignment"]["settled_by"] for record in alone.values())
+
+
+def test_decoys_outlive_a_pass_that_places_their_assets_anew(agreed, tmp_path):
+    """A decoy is a grid with another object's SLAT, and neither of them has changed."""
+    store = copied(agreed[0], tmp_path / "store.zarr")
+    aligned: list[tuple[int, ...]] = []
+    first = measure_errors(open_store(store), decoys=14, progress=lambda *at: aligned.append(at))
+    assert len(aligned) == len(first.decoys) >= 10
+    settled = copied(agreed[1], tmp_path / "settled.zarr")
+    shutil.copy(manifests_of(store) / ERRORS, manifests_of(settled) / ERRORS)
+    assert any("first_pass" in record for record in records_beside(settled).values())
+    assert told_of(open_store(settled))[-1].startswith("measured before the last update")
+    after = measure_errors(open_store(settled), decoys=14, progress=lambda *at: aligned.append(at))
+    assert len(aligned) == len(first.decoys), "all were taken over"
+    assert [one.keys for one in after.decoys] == [one.keys for one in first.decoys]
 
 
 def test_the_store_alone_gives_the_verdicts_on_ties(agreed):
