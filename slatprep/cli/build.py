@@ -191,6 +191,7 @@ def build_store(
                     jobs=jobs,
                     fresh=fresh,
                     rehash=rehash == 1,
+                    decoys=decoys,
                     progress=progress,
                     note=output.note,
                 )

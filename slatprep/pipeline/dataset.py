@@ -44,6 +44,7 @@ from slatprep.readers.published import fetch_members
 from slatprep.records import AssetPair, Normalization, Place
 from slatprep.storage.atomic import staged, telling_if_stopped, writing
 from slatprep.storage.place import storage_of
+from slatprep.storage.work import require_work_folder
 from slatprep.store.reader import require_outside
 from slatprep.store.record import FailedRecord
 from slatprep.store.record_json import build_id_of, digest_of, to_json
@@ -212,12 +213,19 @@ def plan_build(
     jobs: Jobs = 1,
     fresh: bool = False,
     rehash: bool = False,
+    decoys: int = DECOYS,
     progress: Progress | None = None,
     note: Note | None = None,
 ) -> BuildPlan:
-    """Return what `build_store` would do with each asset, and why; write nothing."""
+    """Return what `build_store` would do with each asset, and why; write nothing.
+
+    What stands in its way, such as another's files beside the store, is raised as by the build.
+    """
     parameters = checked(BuildParameters, parameters)
     place, wanted = Destination(out, manifests), Wanted.of(parameters)
+    if decoys:
+        writable_file(place.store)
+    require_work_folder(place.store)
     crew = Crew(jobs, progress=progress)
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:

@@ -55,8 +55,8 @@ class Destination:
             require_beside(folder := Path(str(manifests_of(path))))
         if folder is not None:
             _require_records(folder, storage_of(self.store).local)
-            if path is not None:
-                _require_own(folder, path)
+            if (real := storage_of(self.store).local) is not None:
+                _require_own(folder, real)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
         self.if_stopped: list[str] = []

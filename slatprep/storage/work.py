@@ -92,15 +92,26 @@ def _claim(directory: Path) -> None:
     # The file has no name if the system can do that, so a signal leaves nothing behind.
     with tempfile.TemporaryFile(dir=directory.parent) as ours:
         owner = os.fstat(ours.fileno()).st_uid
+    # If it is gone, a build has just ended there, and taking the lock makes the folder again.
+    _require_ours(directory, owner)
+
+
+def require_work_folder(target: Place) -> None:
+    """Raise StoreError if something else has the place of a target's work folder; write nothing."""
+    _require_ours(storage_of(target).work_folder())
+
+
+def _require_ours(directory: Path, owner: int | None = None) -> None:
+    """Raise StoreError unless a folder is this user's slatprep's, or is not there."""
     try:
         state = directory.lstat()
         if not stat.S_ISDIR(state.st_mode):
             raise refusal(directory, "is no folder")
-        if state.st_uid != owner:
+        if owner is not None and state.st_uid != owner:
             raise refusal(directory, f"belongs to user {state.st_uid}")
         names = {path.name for path in directory.iterdir()}
     except FileNotFoundError:
-        return  # A build has just ended there, and taking the lock makes the folder again.
+        return
     if names and LOCK not in names:
         raise refusal(directory, f"holds {min(names)} and was not made by a build")
 

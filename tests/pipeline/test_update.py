@@ -203,6 +203,31 @@ def test_a_dry_run_looks_where_the_build_does(built, tmp_path):
     assert not own.exists()
 
 
+def test_a_dry_run_tells_of_other_files_in_the_way_as_the_build_does(built, tmp_path):
+    dataset, _ = built
+    words = ("build-store", *dataset.sides, "--out")
+    (tmp_path / "t.manifests").mkdir()
+    (tmp_path / "t.manifests" / "decoys.json").write_text("mine")
+    (tmp_path / ".u.zarr.work").mkdir()
+    (tmp_path / ".u.zarr.work" / "mine").touch()
+    (tmp_path / ".v.zarr.work").symlink_to(tmp_path)
+    for name, said in (("t", "not slatprep's"), ("u", "holds mine"), ("v", "is no folder")):
+        out = tmp_path / f"{name}.zarr"
+        dry, wet = (run(*words, out, *more, code=1).output for more in (["--dry-run"], []))
+        assert said in dry and dry == wet
+    assert "taken over" not in run(*words, tmp_path / "t.zarr", "--decoys", 0, "--dry-run").output
+
+
+def test_a_build_through_a_link_minds_no_store_beside_the_link(built, tmp_path):
+    """Names of records are those beside the store, not those beside a link to it."""
+    dataset, out = built
+    (tmp_path / "links").mkdir()
+    shutil.copytree(out, tmp_path / "links" / out.name)
+    link = tmp_path / "links" / "current.zarr"
+    link.symlink_to(out)
+    assert build_store(dataset.parameters(), link).unchanged
+
+
 def test_a_dry_run_writes_nothing(built):
     dataset, out = built
     before = tree(out.parent)
