@@ -105,7 +105,8 @@ def units_now(stated: Units, bare: Units) -> dict[str, str]:
 def in_si(units: Mapping[str, str], part: Part) -> Part:
     """Convert a part from these units, by property, to SI units, rounded as fields hold them."""
     values = (to_si(one, units[k.name]) for k, one in zip(PROPERTIES, part.values, strict=True))
-    return Part(part.name, part.share, *(float(np.float32(one)) for one in values))
+    with np.errstate(over="ignore"):  # A unit that is only tried may give more than a float32.
+        return Part(part.name, part.share, *(float(np.float32(one)) for one in values))
 
 
 def beyond_all(part: Part) -> str:

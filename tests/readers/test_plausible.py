@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -153,6 +154,13 @@ SWAPPED = {
 def test_what_no_unit_explains_is_named(read, parts, words):
     with pytest.raises(InputError, match=words):
         read(*parts)
+
+
+def test_a_guess_that_no_float_holds_is_no_warning_of_numpy(read):
+    """Its density would be 10**103 kg/m^3, were it a logarithm."""
+    with warnings.catch_warnings(), pytest.raises(InputError, match="no fluid is lighter"):
+        warnings.simplefilter("error")
+        read((FLUID, 8e4, 103.2, 0.38))
 
 
 def test_a_setting_says_what_becomes_of_it(read):
