@@ -18,7 +18,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError, tally
+from slatprep.errors import ConfigError, StoreError, amount, tally
 from slatprep.normalize import ranges_from_bounds, ranges_from_extents
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.destination import Destination
@@ -150,8 +150,10 @@ def concat_stores(
     rows = _rows(sources)
     times = Counter(row.asset_id for row in rows)
     if twice := sorted(asset_id for asset_id, count in times.items() if count > 1):
+        verb = "is" if len(twice) == 1 else "are"
         raise ConfigError(
-            f"{len(twice)} ids are in more than one store, such as {', '.join(twice[:3])}; "
+            f"{amount(len(twice), 'id')} {verb} in more than one store, such as "
+            f"{', '.join(twice[:3])}; "
             "expected each once: leave them out of one with `slatprep subset`"
         )
     build, contents = _common_build(sources), _common_contents(sources, rows)
@@ -236,6 +238,11 @@ def _shared(documents: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {k: value for k, value in first.items() if all(one.get(k) == value for one in others)}
 
 
+def _once(texts: Iterable[str], apart: str) -> str:
+    """Join texts, some of which may be joined already, with each part once."""
+    return apart.join(dict.fromkeys(part for text in texts for part in text.split(apart) if part))
+
+
 def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildParameters:
     """Return the parameters for the build's record: all roots, and what all sources share."""
     encoder = sources[0].contents.latents.encoder
@@ -244,8 +251,8 @@ def _parameters(sources: Sequence[SourceStore], build: dict[str, Any]) -> BuildP
     places = _shared(named)
     for side, known in unknown.items():
         each = [own[side] for own in named]
-        roots = dict.fromkeys(own["root"] for own in each)
-        places[side] = {**known, **_shared(each), "root": APART.join(roots)}
+        root = _once((own["root"] for own in each), APART)
+        places[side] = {**known, **_shared(each), "root": root}
     document = {"name": build["name"], **places, **build["parameters"]}
     try:
         return read_as(BuildParameters, orjson.dumps(document))
@@ -274,8 +281,8 @@ def _common_build(sources: Sequence[SourceStore]) -> dict[str, Any]:
             versions.setdefault(name, []).append(version)
     return {
         **first.build,
-        "name": " + ".join(dict.fromkeys(s.build["name"] for s in sources if s.build["name"])),
-        "versions": {name: ", ".join(dict.fromkeys(found)) for name, found in versions.items()},
+        "name": _once((source.build["name"] for source in sources), " + "),
+        "versions": {name: _once(found, ", ") for name, found in versions.items()},
     }
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -69,6 +70,23 @@ def test_an_update_of_a_subset_has_the_ranges_of_its_own_dataset(make_dataset, t
     build_store(parameters, out)
     build_store(parameters, tmp_path / "first.zarr")
     assert tree(out) == tree(tmp_path / "first.zarr")
+
+
+def test_a_store_joined_in_two_ways_is_the_same(tmp_path):
+    """Names, versions and roots are told once, also where a part was joined before."""
+    stores = [tmp_path / f"{name}.zarr" for name in "abc"]
+    for name, path in zip("xyy", stores, strict=True):
+        dataset = Dataset(tmp_path / path.stem).having(path.stem)
+        build_store(replace(dataset.parameters("pixie"), name=name), path)
+    concat_stores(stores, tmp_path / "one.zarr")
+    concat_stores(stores[:2], tmp_path / "ab.zarr")
+    concat_stores([tmp_path / "ab.zarr", stores[2]], tmp_path / "two.zarr")
+    assert open_store(tmp_path / "two.zarr").attributes["build"]["name"] == "x + y"
+    assert tree(tmp_path / "one.zarr") == tree(tmp_path / "two.zarr")
+    subset_store(tmp_path / "two.zarr", tmp_path / "c.part.zarr", ["c"])
+    concat_stores([tmp_path / "ab.zarr", tmp_path / "c.part.zarr"], tmp_path / "three.zarr")
+    one, three = (build_in(tmp_path / f"{name}.manifests") for name in ("one", "three"))
+    assert three.parameters.slat.root == one.parameters.slat.root
 
 
 def test_a_text_is_one_asset_and_nothing_is_no_place(folder, tmp_path):
