@@ -150,10 +150,8 @@ def concat_stores(
     rows = _rows(sources)
     times = Counter(row.asset_id for row in rows)
     if twice := sorted(asset_id for asset_id, count in times.items() if count > 1):
-        verb = "is" if len(twice) == 1 else "are"
         raise ConfigError(
-            f"{amount(len(twice), 'id')} {verb} in more than one store, such as "
-            f"{', '.join(twice[:3])}; "
+            f"the stores share {amount(len(twice), 'id')}, such as {', '.join(twice[:3])}; "
             "expected each once: leave them out of one with `slatprep subset`"
         )
     build, contents = _common_build(sources), _common_contents(sources, rows)
