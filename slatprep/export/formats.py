@@ -136,7 +136,7 @@ def annotated_points(asset: StoredAsset, points: Points) -> AnnotatedPoints:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of some formats; ConfigError if one makes no sense.
+    """Options of some formats; ConfigError for an unknown word or a wrong size of shards.
 
     Attributes
     ----------

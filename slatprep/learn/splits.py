@@ -28,7 +28,7 @@ def assign_store(
     rows = np.flatnonzero(store.column("valid_share") > 0).tolist()
     named = [tuple(str(column[row]) for column in columns) for row in rows]
     objects = {object_id: category for _, object_id, category in named}
-    return assign_splits(str(by), objects, shares, {asset: name for asset, name, _ in named})
+    return assign_splits(by, objects, shares, {asset: name for asset, name, _ in named})
 
 
 def select_assets(

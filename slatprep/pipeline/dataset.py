@@ -219,13 +219,14 @@ def plan_build(
 ) -> BuildPlan:
     """Return what `build_store` would do with each asset, and why; write nothing.
 
-    What stands in its way, such as another's files beside the store, is raised as by the build.
+    Another's files where the store, its work folder and its records go are refused as by the build.
     """
     parameters = checked(BuildParameters, parameters)
     place, wanted = Destination(out, manifests), Wanted.of(parameters)
     if decoys:
         writable_file(place.store)
     require_work_folder(place.store)
+    place.look()
     crew = Crew(jobs, progress=progress)
     spool = spool_of(place.store, private_disks=not isinstance(jobs, int))
     if fresh:

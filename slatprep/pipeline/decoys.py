@@ -194,7 +194,7 @@ def _evidence_of(store: Store) -> tuple[dict[str, str], list[str], NDArray[np.fl
             own = (file["sha256"] for file in record["sources"] if file["role"] == "grid")
             grids.append(next(own, ""))
             evidence.append(np.array(record["judgement"]["evidence"], dtype=np.float64))
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, AttributeError):
             raise StoreError(
                 f"{store.path}: the record of {asset_id} cannot be read; run `slatprep verify`"
             ) from None

@@ -108,7 +108,7 @@ class Assignment:
 
 
 def assign_splits(
-    by: str,
+    by: str | Place,
     objects: Mapping[str, str],
     shares: Shares = Shares(),
     assets: Mapping[str, str] | None = None,
@@ -126,7 +126,7 @@ def assign_splits(
         return Assignment(split_objects(objects, shares))
     if by == PIXIE:
         return Assignment(_around(pixie_test_objects(objects), objects, shares))
-    if by.startswith(CATEGORY):
+    if isinstance(by, str) and by.startswith(CATEGORY):  # A path is no word for a rule.
         name = by.removeprefix(CATEGORY)
         chosen = [object_id for object_id, category in objects.items() if category == name]
         if not chosen:

@@ -98,7 +98,9 @@ def _claim(directory: Path) -> None:
 
 def require_work_folder(target: Place) -> None:
     """Raise StoreError if something else has the place of a target's work folder; write nothing."""
-    _require_ours(storage_of(target).work_folder())
+    directory = storage_of(target).work_folder()
+    with writing(str(target), directory.parent):
+        _require_ours(directory)
 
 
 def _require_ours(directory: Path, owner: int | None = None) -> None:

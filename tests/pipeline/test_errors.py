@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.commands import document, run
-from support.made_store import edit_record
+from support.made_store import edit_record, rewrite
 from support.trees import copied, tree
 
 from slatprep import Store, StoreError, open_store
@@ -106,6 +106,9 @@ def test_a_store_with_figures_of_another_version_is_told(mixed_build, tmp_path):
     for row in range(5):
         edit_record(out, row, lambda one: one["judgement"]["evidence"].pop())
     with pytest.raises(StoreError, match="hold other evidence; build it again"):
+        measure_errors(open_store(out))
+    rewrite(out, "asset/record", 0, "[]")
+    with pytest.raises(StoreError, match="cannot be read; run `slatprep verify`"):
         measure_errors(open_store(out))
 
 

@@ -216,6 +216,9 @@ def test_a_dry_run_tells_of_other_files_in_the_way_as_the_build_does(built, tmp_
         dry, wet = (run(*words, out, *more, code=1).output for more in (["--dry-run"], []))
         assert said in dry and dry == wet
     assert "taken over" not in run(*words, tmp_path / "t.zarr", "--decoys", 0, "--dry-run").output
+    (tmp_path / "file").touch()
+    with pytest.raises(StoreError, match=r"cannot be written to .*file"):
+        plan_build(dataset.parameters(), tmp_path / "file" / "x.zarr")
 
 
 def test_a_build_through_a_link_minds_no_store_beside_the_link(built, tmp_path):

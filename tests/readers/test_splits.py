@@ -49,6 +49,14 @@ def test_what_no_rule_tests_on_is_parted_by_the_hash(shares):
         assert {name: split for name, split in splits.items() if split != "test"} == rest
 
 
+def test_a_path_is_a_file_even_if_it_is_called_as_a_rule(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("pixie").write_text("\n".join(SOME))
+    splits = assign_splits(Path("pixie"), OBJECTS).splits
+    named = {name for name, split in splits.items() if split == "test"}
+    assert named == set(SOME)
+
+
 def test_a_category_that_is_not_there_is_named():
     with pytest.raises(ConfigError, match="'cars'; expected one of: rocks, tree"):
         assign_splits("category:cars", OBJECTS)

@@ -284,6 +284,8 @@ def test_places_that_take_nothing_are_told_first(
     s3.pipe_file(f"{bucket}/mine/notes.txt", b"keep")
     with pytest.raises(StoreError, match=f"^s3://{bucket}/mine holds notes.txt and is not"):
         build_store(parameters, f"s3://{bucket}/mine")
+    with pytest.raises(StoreError, match=f"^s3://{bucket}/mine holds notes.txt and is not"):
+        plan_build(parameters, f"s3://{bucket}/mine")
     with pytest.raises(StoreError, match=f"is one version .* expected {published}$"):
         build_store(parameters, open_store(published).path)
     with pytest.raises(StoreError, match="expected a local folder for the records"):
