@@ -112,7 +112,6 @@ def clipped_values(store: Store, ids: Iterable[str], points: Points) -> tuple[st
 
 def annotated_points(asset: StoredAsset, points: Points) -> AnnotatedPoints:
     """Return the valid SLAT voxels, or the annotated voxels of the field at distance 0."""
-    require_one_of("points", points, get_args(Points))
     if points == "grid":
         field, place_map = asset.field, StoredRecords(asset.store).place_map(asset)
         centres = voxel_centres(field.voxels)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slatprep.errors import ConfigError, InputError
+from slatprep.errors import ConfigError, InputError, require_one_of
 from slatprep.export.formats import Points as Points
-from slatprep.export.formats import annotated_points, require_solver_classes
+from slatprep.export.formats import require_solver_classes
 from slatprep.geometry.deformation import PlaceMap
 from slatprep.geometry.frames import voxel_centres
 from slatprep.geometry.voxels import shown_in_cells
@@ -24,10 +24,12 @@ from slatprep.records import (
     MAX_LATENT_RESOLUTION,
     PIXIEVERSE,
     PROPERTIES,
+    PROPERTY_COLUMNS,
     RESOLUTION,
     Normalization,
 )
 from slatprep.store import Store
+from slatprep.store.records import StoredRecords
 
 
 @dataclass(frozen=True)
@@ -104,16 +106,19 @@ def stored_field(store: Store, name: str | int, points: Points = "slat") -> Voxe
     StoreError if the store has no such asset, lacks a property, or has classes that solvers do not
     know. ConfigError if no voxel of the asset has a material.
     """
-    asset = store.asset(name)
-    there = annotated_points(asset, points)
-    held = there.material, there.solid(asset)
+    require_one_of("points", points, get_args(Points))
+    asset, columns = store.asset(name), store.columns_of(PROPERTY_COLUMNS)
     require_solver_classes(store)
     if points == "grid":
-        surface, _ = asset.cells
-        field = VoxelField(asset.field.voxels, *held, there.place_map, surface=surface)
+        grid = asset.field
+        place_map, (surface, _) = StoredRecords(store).place_map(asset), asset.cells
+        values = grid.properties[:, columns]
+        field = VoxelField(grid.voxels, grid.material, values, place_map, surface=surface)
     else:
-        coords, side = asset.coords[asset.valid], store.contents.latents.resolution
-        field = VoxelField.of_slat(coords, side, *held)
+        valid = asset.valid
+        values = asset.properties_si[valid][:, columns]
+        side = store.contents.latents.resolution
+        field = VoxelField.of_slat(asset.coords[valid], side, asset.material[valid], values)
     if len(field.voxels) == 0:
         raise ConfigError(
             f"{store.path}: no voxel of {asset.asset_id} has a material; expected an asset whose "

@@ -54,8 +54,9 @@ class Destination:
         if folder is None and path is not None:
             require_beside(folder := Path(str(manifests_of(path))))
         if folder is not None:
-            _require_records(folder, storage_of(self.store).local)
-            if (real := storage_of(self.store).local) is not None:
+            real = storage_of(self.store).local
+            _require_records(folder, real)
+            if real is not None:
                 _require_own(folder, real)
         self._before: PublishedState | None = None
         self._upload: Upload | None = None
