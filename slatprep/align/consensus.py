@@ -44,6 +44,9 @@ LEAST_LIKELY = 0.55
 SURE = 0.95
 """Smallest probability at which an asset without a tie takes the common rotation."""
 
+OTHER_SCALE = 0.04
+"""Smallest difference of the logarithms of two scales between which no rotation chooses."""
+
 _QUARTERS = 24
 
 NEAR_DEGREES = 30.0
@@ -80,16 +83,20 @@ def find_consensus(transforms: ArrayLike, objects: Sequence[str]) -> Consensus |
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
     """Choose, among tied placements, the one nearest to the common rotation.
 
-    Return the same object if nothing is tied, no tied placement has the common rotation, or another
-    one is likelier.
+    Return the same object if nothing is tied, no tied placement has the common rotation, some of
+    different scales have it, or another one is likelier.
     """
     if not alignment.placements:
         return alignment
     ties = [Placement(alignment.transform, alignment.score, 0.0), *alignment.placements]
-    rotations = np.array([split_transform(tie.transform)[0] for tie in ties])
+    split = [split_transform(tie.transform) for tie in ties]
+    rotations = np.array([rotation for rotation, _, _ in split])
     angles = degrees_between(rotations, consensus.rotation)
     chosen = int(np.argmin(angles))
-    if angles[chosen] > NEAR_DEGREES:
+    scales = np.log([scale for _, _, scale in split])
+    # A rotation does not choose between two scales.
+    others = (angles <= NEAR_DEGREES) & (abs(scales - scales[chosen]) > OTHER_SCALE)
+    if angles[chosen] > NEAR_DEGREES or others.any():
         return alignment
     odds, scores = _odds_of(consensus, rotations), np.array([tie.score for tie in ties])
     # The score is NaN for an engine that ranks by fitness alone.

@@ -49,7 +49,7 @@ from slatprep.align.mirror import mirror_gain
 from slatprep.align.pair import COARSE, DISTINCT, MOST_SURVIVORS, POLISH, TIE, Pair
 from slatprep.align.pose import Pose, Similarity
 from slatprep.align.quality import compare
-from slatprep.align.search import ranked, repeated, search_all
+from slatprep.align.search import of_scale_one, ranked, repeated, search_all
 from slatprep.align.starts import candidates_of, distinct_starts
 from slatprep.align.surface import surface_of, surfaces_of
 from slatprep.align.warp import Warp
@@ -203,6 +203,7 @@ def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
     # Near placements come as `finish` returns them: these scores are more reliable.
     others = pair.others(best, [*tied[1:], *(pose for pose in poses if pose not in near)])
     rivals = [pose.behind for pose in others if pose.merit > best.merit - reach]
+    traded = of_scale_one(pair, best) if best.score >= POOR else []
     starts = zip(distinct_starts(), fits, strict=True)
     fitted = {start.index: (fit.fitness, fit.rmse) for start, fit in starts}
     transform = best.similarity.transform
@@ -217,8 +218,10 @@ def _alignment(pair: Pair, candidates: Candidates) -> Alignment:
         margin=max(best.merit - others[0].merit, 0.0) if others else 1.0,
         placements=tuple(
             Placement(pose.similarity.transform, pose.score, float(pair.apart([pose], best)[0]))
-            for pose in others[:MOST_SURVIVORS]
-            if pose.behind < 0.0 or (pose.merit > best.merit - tie and not pose.behind >= CLEARLY)
+            for pose in [*others[:MOST_SURVIVORS], *traded]
+            if pose in traded
+            or pose.behind < 0.0
+            or (pose.merit > best.merit - tie and not pose.behind >= CLEARLY)
         ),
         score=best.score,
         deformation=deformed.deformation,

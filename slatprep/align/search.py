@@ -27,6 +27,7 @@ from slatprep.align.pose import Pose, Poses
 from slatprep.align.starts import so3_starts
 from slatprep.align.stretch import stretch
 from slatprep.align.warp import Warp, from_nearest, places_of
+from slatprep.geometry.frames import Array
 
 SO3_STARTS, SO3_HALFWAY, SO3_KEPT = 240, 4, 80
 """Number of starts over all orientations, of steps before a selection, and of starts kept then.
@@ -40,6 +41,10 @@ share of the extent."""
 
 REPEATED, REPEATED_KEPT = Steps(40, (3.0, 2.0), 0.02), 24
 """First steps of such poses, and the number of poses that are refined further."""
+
+TRADED, TRADED_WITHIN = 0.015, 0.15
+"""Product of a scale's logarithm and an offset [voxel] from which a part may lack instead, and by
+how much a placement of scale one may score less then and still tie."""
 
 SAME_SIZE = 0.05
 """Largest difference of the size ratio from one without a second set of starts at scale one."""
@@ -106,9 +111,7 @@ def repeated(pair: Pair, best: Pose) -> list[Pose]:
     about = Rotation.from_rotvec(vectors).as_matrix().reshape(3, -1, 3, 3)
     across = about @ np.roll(half, -1, axis=0)[:, None]
     turns = np.concatenate([about[:, 1:], across], axis=1).reshape(-1, 3, 3)
-    by = np.outer([1.0, -1.0], np.arange(SLIDE, MOST_SLID, SLIDE)).reshape(-1, 1)
-    far = REACH * np.ptp(axes @ pair.slat.points.T, axis=1)
-    slides = (by[:, :, None] * axes)[np.abs(by) < far]
+    slides = _slides(pair)
     turned = np.concatenate([turns, np.repeat([np.eye(3), *half], len(slides), axis=0)])
     moved = np.concatenate([np.zeros((len(turns), 3)), *[slides] * 4])
     own = best.similarity
@@ -119,6 +122,29 @@ def repeated(pair: Pair, best: Pose) -> list[Pose]:
     order = np.argsort(-fits[:, :2].sum(axis=1), kind="stable")[:REPEATED_KEPT]
     kept = Poses(*(each[order] for each in starts)).similarities()
     return pair.polish(pair.refine([*map(Pose, kept)], COARSE._replace(taus=(2.0, 1.0))))
+
+
+def _slides(pair: Pair) -> Array:
+    """Return shifts (n, 3) [voxel] to and fro along the principal axes of the SLAT's surface."""
+    axes = pair.principal[0].T
+    by = np.outer([1.0, -1.0], np.arange(SLIDE, MOST_SLID, SLIDE)).reshape(-1, 1)
+    far = REACH * np.ptp(axes @ pair.slat.points.T, axis=1)
+    return np.asarray((by[:, :, None] * axes)[np.abs(by) < far])
+
+
+def of_scale_one(pair: Pair, best: Pose) -> list[Pose]:
+    """Return the distinct placements of scale one that a pose's scale and offset may stand for.
+
+    A tapered bar that lacks an end is a smaller bar with a thicker surface.
+    """
+    own = best.similarity
+    if not pair.free_scale or np.log(own.scale) * own.offset > -TRADED:
+        return []
+    start = pair.at_scale_one(own)._replace(offset=0.0)
+    shifts = start.shift + np.concatenate([np.zeros((1, 3)), _slides(pair)])
+    starts = [Pose(start._replace(shift=shift)) for shift in shifts]
+    others = pair.others(best, pair.refine(starts, POLISH._replace(free_scale=False)))
+    return [pose for pose in others if pose.score > best.score - TRADED_WITHIN]
 
 
 def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from support.demos import made_cases
@@ -17,6 +18,7 @@ from support.faults import environment
 from support.shapes import GRID, chair, field_of, judged, latents_of, surface_latents, turned
 
 from slatprep.align import align, engine_versions, solver
+from slatprep.align.consensus import settle
 from slatprep.align.field import BEATEN, fitted_near
 from slatprep.align.ground import RAISED
 from slatprep.align.pair import FINE, TIE, Pair
@@ -38,7 +40,7 @@ from slatprep.geometry.voxels import boundary, occupancy_of, voxels_of
 from slatprep.inspect.score import compare_with_truth
 from slatprep.parameters import PRESETS, AlignParameters, SampleParameters
 from slatprep.pipeline.annotate import look_up
-from slatprep.records import Engine, MaterialField, StructuredLatents, Verdict
+from slatprep.records import Consensus, Engine, MaterialField, StructuredLatents, Verdict
 from slatprep.sample import sample
 from slatprep.workers.local import single_threaded
 
@@ -426,6 +428,45 @@ def test_what_repeats_itself_is_placed_right_or_is_not_good(whole, other, turn):
     annotation, judgement = look_up(field, latents, alignment, SampleParameters())
     right = annotation.material == there[tuple(latents.coords.T.astype(int))]
     assert right[annotation.valid].mean() > 0.9 or judgement.verdict is not Verdict.GOOD
+
+
+def _bar() -> tuple[np.ndarray, np.ndarray]:
+    """Return a round bar, 50 long, that tapers upwards from 6 to 4, and its classes by height."""
+    x, y, z = np.moveaxis(GRID - np.array([31.5, 31.5, 6.5]), -1, 0)
+    inside = (np.hypot(x, y) < 6.0 - z / 25.0) & (z > 0.0) & (z < 50.0)
+    return inside, np.clip(1 + z // 11, 1, 4)
+
+
+@pytest.mark.parametrize("lacks", ["slat", "pixieverse"])
+@pytest.mark.parametrize("rows", [slice(15, None), slice(0, 49)])
+def test_a_tapered_bar_that_lacks_an_end_may_be_one_of_scale_one(lacks, rows):
+    """Shrunk along its cone and with a thicker surface, the whole bar covers the rest of it."""
+    whole, classes = _bar()
+    rest = np.zeros_like(whole)
+    rest[:, :, rows] = whole[:, :, rows]
+    here, there = (rest, whole) if lacks == "slat" else (whole, rest)
+    field, latents = field_of(there, classes), surface_latents(here)
+    alignment = align(field, latents, AlignParameters())
+    _, _, scale = split_transform(alignment.transform)
+    assert abs(np.log(scale)) > 0.1, "the wrong scale fits best"
+    height = latents.centres[:, 2]
+    moved = [places_of(latents.centres, p.transform)[:, 2] - height for p in alignment.placements]
+    assert min(np.abs(each).mean() for each in moved) < 1 / 64, "the right one is listed"
+    assert judged(field, latents, alignment).verdict is Verdict.DOUBTFUL
+    # All that the dataset shares is the rotation, which both scales have.
+    consensus = Consensus(split_transform(alignment.transform)[0], 9, 9)
+    assert settle(alignment, latents, consensus) is alignment
+
+
+def test_a_smaller_object_with_a_thicker_surface_has_no_tie_of_scale_one():
+    back = ((GRID - 31.5) / 0.85 + 31.5).round().astype(int).clip(0, 63)
+    field, smaller = field_of(chair()), chair()[tuple(np.moveaxis(back, -1, 0))]
+    latents = surface_latents(binary_dilation(smaller))
+    alignment = align(field, latents, DEFAULT)
+    assert split_transform(alignment.transform)[2] == pytest.approx(0.85, abs=0.02)
+    assert alignment.figures is not None and alignment.figures.offset > 0.5
+    assert alignment.placements == ()
+    assert judged(field, latents, alignment).verdict is Verdict.GOOD
 
 
 @pytest.mark.parametrize("flip", [np.eye(3), np.diag([1.0, -1.0, -1.0])])
