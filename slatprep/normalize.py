@@ -109,7 +109,8 @@ def normalize_properties(
     ----------
     properties : array_like, shape (N, P)
         In SI units, a column for each range (Young's modulus [Pa], density
-        [kg/m^3] and Poisson's ratio by default); NaN passes through.
+        [kg/m^3] and Poisson's ratio by default). NaN passes through, and a
+        negative value without a logarithm becomes NaN.
     normalization : Normalization
         The ranges; Pixie's published ranges by default. Those of a store are
         ``store.normalization``.
@@ -127,7 +128,8 @@ def normalize_properties(
     >>> denormalize_properties(values).round(3).tolist()
     [[10000000.0, 1000.0, 0.30000001192092896]]
     """
-    return normalize_and_count(properties, normalization)[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return normalize_and_count(properties, normalization)[0]
 
 
 def normalize_and_count(

@@ -13,7 +13,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
-from slatprep.errors import require_one_of
+from slatprep.errors import ConfigError, require_one_of
 from slatprep.export import target
 from slatprep.export.formats import (
     Exported,
@@ -126,7 +126,9 @@ def export_store(
     begin = time.perf_counter()
     require_one_of("format", format, FORMATS)
     require_workers(jobs)
-    options, opened, out = options or ExportOptions(), open_store(store), local_path_of(out)
+    if not isinstance(options := options or ExportOptions(), ExportOptions):
+        raise ConfigError(f"options are {options!r:.80}; expected slatprep.export.ExportOptions")
+    opened, out = open_store(store), local_path_of(out)
     require_outside(out)
     assets = words_of(assets)
     if verdicts is None:

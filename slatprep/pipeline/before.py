@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from slatprep.errors import SlatprepError, StoreError
+from slatprep.errors import ConfigError, SlatprepError, StoreError
 from slatprep.pipeline.destination import Destination
 from slatprep.pipeline.plan import Crew
 from slatprep.pipeline.recipe import Recipe, Wanted
@@ -167,6 +167,8 @@ def look_back(
 
     The share is drawn with `seed`, or by the clock. With `fresh`, an existing store is ignored.
     """
+    if not 0.0 <= rehash <= 1.0:
+        raise ConfigError(f"rehash is {rehash}; expected a share from 0 to 1")
     before = Before(place, pairs, wanted)
     if fresh:
         return before

@@ -144,15 +144,16 @@ def concat_stores(
     StoreError
         If a store cannot be read, or the new store cannot be written.
     """
+    stores = [stores] if isinstance(stores, str) else list(stores)
+    if len(stores) < 2:
+        raise ConfigError(f"{amount(len(stores), 'store')} to join; expected two or more")
     sources = [_source(store) for store in stores]
-    if len(sources) < 2:
-        raise ConfigError(f"{len(sources)} stores to join; expected two or more")
     rows = _rows(sources)
     times = Counter(row.asset_id for row in rows)
     if twice := sorted(asset_id for asset_id, count in times.items() if count > 1):
         raise ConfigError(
             f"the stores share {amount(len(twice), 'id')}, such as {', '.join(twice[:3])}; "
-            "expected each once: leave them out of one with `slatprep subset`"
+            "expected each once: name the others with `slatprep subset --asset`"
         )
     build, contents = _common_build(sources), _common_contents(sources, rows)
     place, parameters = Destination(out, manifests), _parameters(sources, build)

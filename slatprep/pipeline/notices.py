@@ -28,6 +28,9 @@ _WILD_DECADES, _WILD_WIDTHS = 1.0, 9.0
 _BESIDE_PIXIE = 0.5
 """Decades by which PixieVerse itself may exceed Pixie's published ranges."""
 
+_TOLD = 100
+"""Number of assets whose faults are told if no record tells them."""
+
 _MOVED = 1e-6
 """Largest move of an end without a notice, as a share of its range: rounding moves it less."""
 
@@ -39,22 +42,25 @@ _AT_BOUND = 1e-3
 
 
 def nothing_usable(
-    failed: Sequence[FailedRecord], parameters: BuildParameters, pairs: Collection[AssetPair] = ()
+    failed: Sequence[FailedRecord],
+    parameters: BuildParameters,
+    pairs: Collection[AssetPair] = (),
+    replaces: bool = False,
 ) -> str:
-    """Say why there is no store."""
+    """Say why there is no store, or why one that `replaces` another is not written."""
     if unmatched := explain_unmatched(pairs, parameters):
-        return f"{unmatched}. There is no store"
+        return f"{unmatched}. {'The store stays as it was' if replaces else 'There is no store'}"
     problems = [f"\n  {asset.asset_id}: {asset.reason}" for asset in failed]
     if not problems:
         return (
             f"no asset found in {parameters.pixieverse.root} and {parameters.slat.root}; "
             "expected files that match the patterns of the dataset definition"
         )
-    more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
-    return (
-        f"none of {len(problems)} assets can be used, so there is no store:"
-        f"{''.join(problems[:5])}{more}"
-    )
+    more = f"\n  and {len(problems) - _TOLD:,} more" if len(problems) > _TOLD else ""
+    so = "assets can be used, so there is no store"
+    if replaces:
+        so = "assets can be used, so the store stays as it was"
+    return f"none of {len(problems):,} {so}:{''.join(problems[:_TOLD])}{more}"
 
 
 def dataset_notices(

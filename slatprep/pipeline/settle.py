@@ -21,6 +21,7 @@ from slatprep.pipeline.spool import Spool
 from slatprep.readers.contents import resolve_latents
 from slatprep.readers.splits import Shares, assign_splits
 from slatprep.records import AssetPair, Contents, LatentSpace, Normalization, Property
+from slatprep.store.reader import is_store
 from slatprep.store.record import FailedRecord
 from slatprep.workers.local import Jobs, run_unordered
 
@@ -46,7 +47,9 @@ def settle_rows(
     rows = [asset for asset in assets if isinstance(asset, Row)]
     failed = [asset for asset in assets if isinstance(asset, FailedRecord)]
     if not rows:
-        raise StoreError(nothing_usable(failed, parameters, before.pairs))
+        raise StoreError(
+            nothing_usable(failed, parameters, before.pairs, is_store(before.place.store))
+        )
     stores: tuple[SourceStore, ...] = ()
     if before.previous is not None and not all(row.spooled for row in rows):
         stores = (before.previous,)

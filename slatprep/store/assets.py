@@ -18,7 +18,14 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from slatprep.errors import ConfigError, StoreError, UnknownAssetError, amount, require_one_of
+from slatprep.errors import (
+    UNKNOWN,
+    ConfigError,
+    StoreError,
+    UnknownAssetError,
+    amount,
+    require_one_of,
+)
 from slatprep.records import Contents, Normalization, Place, Verdict, words_of
 from slatprep.storage.place import Folder, storage_of
 from slatprep.storage.remote import connected
@@ -247,6 +254,8 @@ class AssetTable:
         if categories:
             own = self.column("category").astype(str)
             known = sorted(set(own.tolist()))
+            if UNKNOWN not in known:  # Tables call the assets without one so.
+                categories = ["" if one == UNKNOWN else one for one in categories]
             for one in sorted(set(categories).difference(known)):
                 close = difflib.get_close_matches(one, known, n=1) or list(filter(None, known))
                 expected = f"expected {', '.join(close)}" if close else "no category is known"
@@ -453,7 +462,13 @@ def number_of(row: int, count: int, where: object) -> int:
             f"{row} is an entry of a mask, not an asset; expected the rows that the mask chooses: "
             "numpy.flatnonzero(mask)"
         )
-    if not -count <= (number := operator.index(row)) < count:
+    try:
+        number = operator.index(row)
+    except TypeError:
+        raise UnknownAssetError(
+            f"{row!r:.80} names no asset; expected one id or one number"
+        ) from None
+    if not -count <= number < count:
         raise UnknownAssetError(
             f"{where} has no asset {number}; it has {amount(count, 'asset')}, numbered from 0"
         )

@@ -104,7 +104,7 @@ def _run_here(
 def require_workers(jobs: Jobs) -> None:
     """Raise `ConfigError` unless there is a worker."""
     if not hasattr(jobs, "run_unordered") and (not isinstance(jobs, int) or jobs < 1):
-        raise ConfigError(f"jobs is {jobs!r}; expected a whole number from 1, or other workers")
+        raise ConfigError(f"jobs is {jobs!r}; expected an int from 1, or a cluster")
 
 
 def start_early(function: Callable[..., Any], jobs: Jobs) -> None:

@@ -221,6 +221,8 @@ def test_a_table_of_categories_is_asked_for_unless_it_was_given(store, of_kinds)
         assert ("does not have their ids" in line) == given
         assert ("[pairing]" in line) != given
     assert "no category is known" in refused("list", store, "--category", "cup")
+    every, unknown = (run("list", store, *of).stdout for of in ((), ("--category", "(unknown)")))
+    assert unknown == every
 
 
 def test_advice_names_the_store_as_it_was_typed(store, capsys):

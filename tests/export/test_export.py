@@ -140,7 +140,7 @@ def test_bytes_repeat_whatever_the_jobs(format, store, tmp_path):
     export_store(store, tmp_path / "one" / "export", format, options=options)
     assert bytes_of(tmp_path / "one" / "export") == one
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["export"]
-    with pytest.raises(ConfigError, match="jobs is 0; expected a whole number from 1"):
+    with pytest.raises(ConfigError, match="jobs is 0; expected an int from 1"):
         export_store(store, tmp_path / "one" / "export", format, jobs=0)
 
 
@@ -485,6 +485,11 @@ def test_an_export_looks_what_it_replaces_once_it_has_the_lock(tmp_path, monkeyp
 def test_options_that_make_no_sense_are_refused(given, said):
     with pytest.raises(ConfigError, match=said):
         ExportOptions(**given)
+
+
+def test_options_of_another_kind_are_refused(store, tmp_path):
+    with pytest.raises(ConfigError, match=r"\{'points': 'grid'\}; expected .*ExportOptions"):
+        export_store(store, tmp_path / "x", "ply", options={"points": "grid"})
 
 
 def test_verdicts_may_come_from_a_generator(store, tmp_path):

@@ -65,8 +65,11 @@ def test_no_usable_asset_is_an_error_and_keeps_the_old_store(make_dataset, tmp_p
     build_store(dataset.parameters(), out)
     before = tree(out), tree(tmp_path / "s.manifests")
     dataset.write_slat("a.npz", np.zeros((1, 3), np.uint8), np.zeros((1, 7), np.float32))
-    with pytest.raises(StoreError, match=r"none of 1 assets can be used.*\n  a: .*a\.npz"):
-        build_store(dataset.parameters(), out)
+    for fresh in (False, True):
+        with pytest.raises(StoreError, match=r"1 assets can .* as it was:\n  a: .*a\.npz"):
+            build_store(dataset.parameters(), out, fresh=fresh)
+    with pytest.raises(ConfigError, match="rehash is 2; expected a share from 0 to 1"):
+        build_store(dataset.parameters(), out, rehash=2)
     assert (tree(out), tree(tmp_path / "s.manifests")) == before
     assert len(open_store(out)) == 1
 

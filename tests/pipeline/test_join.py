@@ -193,7 +193,8 @@ def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):
     build_store(other.parameters("pixie", align={"model": "rigid"}), tmp_path / "rigid.zarr")
     for stores, told in (
         ([folder / "abcd.zarr", ac], "the stores share 2 ids, such as a, c"),
-        ([ac], "expected two or more"),
+        ([ac], "1 store to join; expected two or more"),
+        (str(ac), "1 store to join"),
         ([ac, tmp_path / "x.zarr"], "not those of the others"),
         ([ac, tmp_path / "rigid.zarr"], r"rigid\.zarr was built with \[align\]"),
     ):

@@ -194,10 +194,11 @@ def test_assets_are_counted_and_the_first_hundred_problems_listed():
     assert summed_up([], z="good").complete
 
 
-def test_nothing_usable_names_five_and_counts_the_rest():
-    five = nothing_usable([failed(n) for n in range(5)], PARAMETERS)
-    assert "none of 5 assets can be used" in five
-    assert five.splitlines()[1:] == [f"  a00{n}: reason {n}" for n in range(5)]
-    seven = nothing_usable([failed(n) for n in range(7)], PARAMETERS)
-    assert seven.splitlines()[-1] == "  and 2 more"
+def test_nothing_usable_names_a_hundred_and_counts_the_rest():
+    hundred = nothing_usable([failed(n) for n in range(100)], PARAMETERS)
+    assert hundred.startswith("none of 100 assets can be used, so there is no store:")
+    assert hundred.splitlines()[1:] == [f"  a0{n:02}: reason {n}" for n in range(100)]
+    more = nothing_usable([failed(n) for n in range(102)], PARAMETERS, replaces=True)
+    assert more.startswith("none of 102 assets can be used, so the store stays as it was:")
+    assert more.splitlines()[-1] == "  and 2 more"
     assert "no asset found in /grids and /slats" in nothing_usable([], PARAMETERS)

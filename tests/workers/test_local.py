@@ -47,7 +47,7 @@ def test_without_workers_nothing_seems_done(jobs):
         lambda: at_most(3, jobs),
         lambda: require_shared(jobs, []),
     ):
-        with pytest.raises(ConfigError, match=f"jobs is {jobs}; expected a whole number"):
+        with pytest.raises(ConfigError, match=f"jobs is {jobs}; expected an int"):
             call()
 
 

@@ -154,7 +154,7 @@ const Sections = (() => {
     }));
     byId("rotations").replaceChildren(
       el("h3", {}, "Dominant rotations"),
-      el("p", { class: "hint" }, `Where the nearest of the 24 quarter turns takes the axes of the PixieVerse frame, the share of assets, and their median angle to it. ${found.length} of the 24 occur${found.length > few.length ? `; the ${few.length} most frequent are shown` : ""}.`),
+      el("p", { class: "hint" }, `Where the nearest of the 24 quarter turns takes the axes of the PixieVerse frame, the share of assets, and their median angle to it. ${found.length} of the 24 ${found.length === 1 ? "occurs" : "occur"}${found.length > few.length ? `; the ${few.length} most frequent are shown` : ""}.`),
       Charts.bars(rows),
     );
   }
