@@ -146,7 +146,7 @@ def require_prediction(
     if plausibility == "warn":
         return [oddity("values", f'{what}; clipped (plausibility = "warn")')]
     advice = "a grid in SI units, channels last (numpy.moveaxis(grid, 0, -1)), or a prediction"
-    setting = '. plausibility = "warn" clips those of all objects' if plausibility else ""
+    setting = '. plausibility = "warn" clips the values of all objects' if plausibility else ""
     raise InputError(where, what, advice + setting)
 
 

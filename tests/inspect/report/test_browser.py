@@ -170,7 +170,7 @@ def test_it_opens_sorts_and_filters(opened):
 
 
 def test_a_good_verdict_is_no_more_than_it_rests_on(opened):
-    assert "assets good\n100.0 %\n" in opened.find_element("id", "tiles").text  # of those stored
+    assert "stored assets good\n100.0 %\n" in opened.find_element("id", "tiles").text
     assert cut(opened) == []
     unusual = opened.find_elements("css selector", "#statelist .chip")[-1]
     assert unusual.text == "⚠ unusual 1"

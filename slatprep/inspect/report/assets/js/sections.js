@@ -15,7 +15,7 @@ const Sections = (() => {
     const valid = known(ASSETS.valid_share.map((share, k) => (share === null ? null : share * ASSETS.voxels[k])));
     const sum = (values) => values.reduce((total, value) => total + value, 0);
     const tiles = [
-      ["assets good", Format.share(counts[0].count / inStore)],
+      ["stored assets good", Format.share(counts[0].count / inStore)],
       ["SLAT voxels", Format.count(CONTENT.voxels)],
       ["of them valid", Format.share(sum(valid) / sum(known(ASSETS.voxels)), 2)],
       ["median fitness", Format.fixed(3)(Format.quantile(known(ASSETS.fitness), 0.5))],
