@@ -16,6 +16,7 @@ from slatprep.align.pose import Similarity
 from slatprep.align.residuals import Residuals
 from slatprep.align.surface import Surface
 from slatprep.align.warp import Warp, from_nearest, halved
+from slatprep.geometry.frames import Array
 from slatprep.parameters import AlignParameters
 from slatprep.records import Deformation, FitFigures, Model
 
@@ -39,6 +40,12 @@ LEAST_GAIN, GAIN_SHARE = 0.01, 0.1
 times the misfit."""
 
 
+WELL, FAR, LACKING, LACKING_TAUS = 0.75, 3.0, 0.05, (1.0,) * 4
+"""Score of a similarity, distance in voxels, and difference of the shares of the two sides' samples
+that are off by more, above which a part lacks. The kernel is narrow then, or the trial would
+stretch the rest over that part."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """A trial fit: a warp with an affine part only, a warp with a coarse lattice, and their scores.
@@ -60,13 +67,21 @@ def try_out(slat: Surface, pixie: Surface, pose: Similarity, samples: int = TRIA
     unseen = residuals.held_out()
     seen = np.flatnonzero(~unseen)
     before = residuals.kernels(start)
-    affine = residuals.fit_affine(start, AFFINE_TAUS, seen)
+    lacks = before.mean() > WELL and _lacks_a_part(*residuals.at(start))
+    affine = residuals.fit_affine(start, LACKING_TAUS if lacks else AFFINE_TAUS, seen)
     between = residuals.kernels(affine)
-    bent = residuals.fit_lattice(residuals.with_lattice(affine), TRIAL_TAUS, seen)
+    taus = LACKING_TAUS if lacks else TRIAL_TAUS
+    bent = residuals.fit_lattice(residuals.with_lattice(affine), taus, seen)
     after = residuals.kernels(bent)
     unseen &= np.isfinite(after)
     scores = [float(k[unseen].mean()) if unseen.any() else 0.0 for k in (before, between, after)]
     return Trial(affine, bent, (scores[0], scores[1], scores[2]), float(after.mean()))
+
+
+def _lacks_a_part(*sides: Array) -> bool:
+    """Return whether far more of one side's samples are far off, by their residuals (N,)."""
+    less, more = sorted(float((abs(side) > FAR).mean()) for side in sides)
+    return more - less > LACKING
 
 
 @dataclass(frozen=True)

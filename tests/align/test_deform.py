@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 from support.deformed import MOVES, Move, bend, occupancy
 from support.residuals import carried, mean_kernel, residuals, within_box
-from support.shapes import chair, crate, field_of, latents_of, surface_latents
+from support.shapes import GRID, chair, crate, field_of, latents_of, surface_latents
 
 from slatprep import align_voxels
 from slatprep.align import align
@@ -117,6 +117,18 @@ def test_the_same_shape_is_not_deformed():
     assert alignment.figures.moved == alignment.figures.bending == 0.0
     # Too good to try, and so is a mirror image.
     assert np.isnan([alignment.figures.evidence_affine, alignment.figures.mirrored]).all()
+
+
+@pytest.mark.parametrize("rows", [slice(18, None), slice(0, 46)], ids=["foot", "mouth"])
+def test_a_vase_is_not_stretched_over_a_part_that_its_annotation_lacks(rows):
+    x, y, z = np.moveaxis(GRID - np.array([31.5, 31.5, 7.5]), -1, 0)
+    vase = (np.hypot(x, y) < 8.0 + 2.8 * np.cos(z / 8)) & (z > 0) & (z < 48)
+    rest = np.zeros_like(vase)
+    rest[:, :, rows] = vase[:, :, rows]
+    latents = surface_latents(vase)
+    places = map_of(align(field_of(rest), latents, DEFAULT)).places(latents.coords)
+    # Its turn about the axis is free.
+    assert np.abs(places - voxel_centres(latents.coords))[:, 2].max() < 0.5 / 64
 
 
 def test_a_tie_is_one_only_if_both_fit_once_deformed():
