@@ -128,7 +128,7 @@ def export(
             opened,
             out,
             kind,
-            assets=assets,
+            assets=None if split == "all" and not assets else assets,
             verdicts=verdicts,
             options=ExportOptions(**given),
             jobs=jobs,

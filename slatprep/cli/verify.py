@@ -138,7 +138,7 @@ def diff(
 
 def _show_difference(output: Output, found: StoreDifference) -> None:
     if found.same:
-        say(f"{found.a} and {found.b} hold the same")
+        say(f"{found.a} and {found.b} hold the same; grids are not compared")
         return
     output.record(
         f"A: {found.a}\nB: {found.b}",

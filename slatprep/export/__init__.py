@@ -81,7 +81,7 @@ def export_store(
     out: str | Path,
     format: str,
     *,
-    assets: Sequence[str | int] = (),
+    assets: Sequence[str | int] | None = None,
     verdicts: Sequence[str] | None = None,
     options: ExportOptions | None = None,
     jobs: int = 1,
@@ -98,11 +98,11 @@ def export_store(
         the same format when complete; other files stay.
     format : str
         The format, one of `FORMATS`; see docs/export.md.
-    assets : str, or sequence of str or int
-        Ids, beginnings of ids, or numbers; empty takes all.
+    assets : str, or sequence of str or int, optional
+        Ids, beginnings of ids, or numbers; None takes all.
     verdicts : str or sequence of str, optional
         Only assets with one of these verdicts; empty or ``all`` takes all. By default `assets` are
-        taken with any verdict; if `assets` is empty, all good and doubtful ones are.
+        taken with any verdict; if `assets` is None, all good and doubtful ones are.
     options : ExportOptions, optional
         Options of some formats.
     jobs : int
@@ -118,8 +118,8 @@ def export_store(
     Raises
     ------
     ConfigError
-        If no asset is left, an id is unknown, `jobs` is below 1, or `out` is a URL, lies in a store
-        or holds something that is not an export of this format.
+        If no asset is named or left, an id is unknown, `jobs` is below 1, or `out` is a URL, lies
+        in a store or holds something that is not an export of this format.
     StoreError
         If the store cannot be read.
     """
@@ -130,7 +130,9 @@ def export_store(
         raise ConfigError(f"options are {options!r:.80}; expected slatprep.export.ExportOptions")
     opened, out = open_store(store), local_path_of(out)
     require_outside(out)
-    assets = words_of(assets)
+    named, assets = assets is not None, words_of(assets)
+    if named and not assets:
+        raise ConfigError("assets is empty; expected one at least, or None for all")
     if verdicts is None:
         verdicts = () if assets else USABLE
     ids = choose_ids(opened, assets, verdicts)

@@ -129,10 +129,11 @@ def _replace_files(new: Path, out: Path, own: frozenset[str], others: set[str]) 
         )
     flush_tree(new)
     own = own.intersection(_names_below(out))  # The index may contain any path.
-    # If this is stopped, the next export knows the files of both.
+    # If this is stopped, the next export knows the files of both, and a reader finds no asset.
     index = json.loads((new / INDEX).read_bytes())
+    there_now = {"assets": [], "files": sorted(own.union(names) - {INDEX})}
     with staged(out / INDEX) as path:
-        path.write_text(json.dumps(index | {"files": sorted(own.union(names) - {INDEX})}))
+        path.write_text(json.dumps(index | there_now))
     for name in names[:-1]:
         if name not in folders:
             (new / name).replace(out / name)

@@ -37,12 +37,22 @@ def voxel_centres(voxels: ArrayLike, resolution: int = RESOLUTION) -> NDArray[np
     ndarray of float64, shape (N, 3)
         Points in [-0.5, 0.5]^3 of the same frame.
 
+    Raises
+    ------
+    ValueError
+        If `voxels` is an occupancy.
+
     Examples
     --------
     >>> voxel_centres([[0, 32, 63]]).tolist()
     [[-0.4921875, 0.0078125, 0.4921875]]
     """
-    return (np.asarray(voxels, dtype=np.float64) + 0.5) / resolution - 0.5
+    indices = np.asarray(voxels)
+    if indices.dtype == bool:
+        raise ValueError(
+            f"an occupancy {indices.shape} is given; expected the indices of voxels (N, 3)"
+        )
+    return (indices.astype(np.float64) + 0.5) / resolution - 0.5
 
 
 def apply_transform(transform: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:

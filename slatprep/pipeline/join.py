@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -51,8 +51,8 @@ def subset_store(
     out: str | Place,
     assets: Iterable[str | int] = (),
     *,
-    verdicts: Collection[str] = (),
-    categories: Collection[str] = (),
+    verdicts: Iterable[str] = (),
+    categories: Iterable[str] = (),
     manifests: str | Place | None = None,
     jobs: Jobs = 1,
     progress: Progress | None = None,
@@ -70,7 +70,7 @@ def subset_store(
         The new store, a path or URL; an existing one is replaced in one step.
     assets : str, or iterable of str or int
         Ids, unique beginnings of ids, or numbers; see `Store.match`.
-    verdicts, categories : str or collection of str
+    verdicts, categories : str or iterable of str
         Take also the assets that have one of the verdicts and one of the categories, whichever is
         given; the verdict ``all`` takes every asset.
     manifests : str or Path, optional
@@ -95,6 +95,7 @@ def subset_store(
     source = _source(store)
     everything = _rows([source])
     chosen = {source.match(name) for name in words_of(assets)}
+    verdicts, categories = words_of(verdicts), words_of(categories)
     if verdicts or categories:
         chosen |= set(np.flatnonzero(source.having(verdicts, categories)).tolist())
     rows = in_order([everything[row] for row in chosen], None, compact=True)
@@ -144,10 +145,12 @@ def concat_stores(
     StoreError
         If a store cannot be read, or the new store cannot be written.
     """
-    stores = [stores] if isinstance(stores, str) else list(stores)
-    if len(stores) < 2:
-        raise ConfigError(f"{amount(len(stores), 'store')} to join; expected two or more")
-    sources = [_source(store) for store in stores]
+    single = isinstance(stores, str | Store) or not isinstance(stores, Iterable)
+    given = [] if single else list(stores)
+    if len(given) < 2:
+        count = amount(len(given) or int(single), "store")
+        raise ConfigError(f"{count} to join; expected two or more")
+    sources = [_source(store) for store in given]
     rows = _rows(sources)
     times = Counter(row.asset_id for row in rows)
     if twice := sorted(asset_id for asset_id, count in times.items() if count > 1):

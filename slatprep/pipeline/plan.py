@@ -13,7 +13,7 @@ from enum import StrEnum
 from functools import partial
 from types import MappingProxyType
 
-from slatprep.errors import MissingPartnerError, SlatprepError, StoreError
+from slatprep.errors import ConfigError, MissingPartnerError, SlatprepError, StoreError
 from slatprep.parameters import BuildParameters
 from slatprep.pipeline.recipe import Recipe
 from slatprep.pipeline.rows import Names, SourceStore
@@ -45,6 +45,10 @@ class Crew:
     assets_per_job: int = 1
     progress: Progress | None = None
     note: Note | None = None
+
+    def __post_init__(self) -> None:
+        if self.assets_per_job < 1:
+            raise ConfigError(f"assets_per_job is {self.assets_per_job}; expected at least 1")
 
     def of(self, assets: int) -> Jobs:
         """Return the workers for a number of assets."""

@@ -105,8 +105,10 @@ for _material, _colour in MATERIAL_COLOURS.items():
 _Word = TypeVar("_Word")
 
 
-def words_of(given: str | Iterable[_Word]) -> tuple[str | _Word, ...]:
-    """Return words as a tuple; a text is a single word."""
+def words_of(given: str | Iterable[_Word] | None) -> tuple[str | _Word, ...]:
+    """Return words as a tuple; a text is a single word, and None is none."""
+    if given is None:
+        return ()
     return (given,) if isinstance(given, str) else tuple(given)
 
 

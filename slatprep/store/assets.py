@@ -148,7 +148,7 @@ class AssetTable:
         """The tables of the store's properties and classes, and its latent space."""
         return self.about.contents
 
-    def columns_of(self, names: Sequence[str]) -> list[int]:
+    def columns_of(self, names: Iterable[str]) -> list[int]:
         """Return the indices of properties among the store's property columns.
 
         Raises
@@ -156,7 +156,7 @@ class AssetTable:
         StoreError
             If the store lacks one of them.
         """
-        held = list(self.about.property_columns)
+        held, names = list(self.about.property_columns), words_of(names)
         if missing := [name for name in names if name not in held]:
             lacking, there = " and no ".join(missing), ", ".join(held)
             raise StoreError(

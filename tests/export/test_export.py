@@ -266,6 +266,7 @@ def test_an_export_stopped_beside_other_files_keeps_the_old_ones_and_is_made_aga
     monkeypatch.undo()
     old = {"a/x", "c/y"} if moves < len(new) else set()
     assert set(bytes_of(out)) >= {"mine", "b", "index.json", *old, *new[:moves]}
+    assert json.loads((out / "index.json").read_text())["assets"] == [], "none is whole yet"
     made(out, *new)
     assert bytes_of(out).keys() == {"mine", "index.json", *new}
     made(out, "g")
@@ -490,6 +491,12 @@ def test_options_that_make_no_sense_are_refused(given, said):
 def test_options_of_another_kind_are_refused(store, tmp_path):
     with pytest.raises(ConfigError, match=r"\{'points': 'grid'\}; expected .*ExportOptions"):
         export_store(store, tmp_path / "x", "ply", options={"points": "grid"})
+
+
+@pytest.mark.parametrize("none", [(), np.array([], int), iter([])])
+def test_a_choice_of_no_asset_is_not_all(store, tmp_path, none):
+    with pytest.raises(ConfigError, match="assets is empty; expected one at least, or None"):
+        export_store(store, tmp_path / "x", "npz", assets=none)
 
 
 def test_verdicts_may_come_from_a_generator(store, tmp_path):

@@ -105,6 +105,11 @@ def test_voxels_and_occupancy_are_two_forms_of_one_set(voxels):
     assert {tuple(v) for v in voxels_of(occupancy_of(np.array(sorted(voxels)))).tolist()} == voxels
 
 
+def test_an_occupancy_has_no_centres():
+    with pytest.raises(ValueError, match=r"an occupancy .* is given; expected the indices"):
+        voxel_centres(np.ones((2, 2, 3), bool))
+
+
 def test_displacement_by_hand():
     shifted = make_transform(np.eye(3), [3 / 64, 4 / 64, 0])
     some = voxel_centres([[1, 2, 3], [60, 5, 9]])

@@ -200,8 +200,12 @@ def test_what_does_not_go_together_is_refused(folder, make_dataset, tmp_path):
     ):
         with pytest.raises(ConfigError, match=told):
             concat_stores(stores, out)
+    with pytest.raises(ConfigError, match="1 store to join"):
+        concat_stores(open_store(ac), out)
     with pytest.raises(StoreError, match="has no asset 'z'"):
         subset_store(ac, out, ["z"])
+    with pytest.raises(ConfigError, match="expected one at least"):
+        subset_store(ac, out, verdicts=iter([]), categories=iter([]))
     with pytest.raises(ConfigError, match="expected one at least"):
         subset_store(ac, out, [])
     assert not out.exists()

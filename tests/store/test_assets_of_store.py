@@ -145,7 +145,10 @@ def test_an_entry_of_a_mask_is_no_asset(made):
 
 def test_properties_are_found_by_name(made):
     store, _ = made
-    assert store.columns_of(["poissons_ratio", "youngs_modulus"]) == [2, 0]
+    for names in (["poissons_ratio", "youngs_modulus"], iter(["poissons_ratio", "youngs_modulus"])):
+        assert store.columns_of(names) == [2, 0]
+    assert store.columns_of("density") == [1]
+    assert store.having(None, None).all()
     with pytest.raises(StoreError) as raised:
         store.columns_of(["density", "colour", "taste"])
     assert str(raised.value) == (

@@ -22,7 +22,7 @@ from slatprep.pipeline.rows import SourceStore
 from slatprep.readers.patterns import ASSET_ID, NAME
 from slatprep.records import RESOLUTION, Engine, Model, Place, Search, SourceRoots, Verdict
 from slatprep.storage.place import place_of, storage_of
-from slatprep.store.assets import AttributesError
+from slatprep.store.assets import AttributesError, other_store
 from slatprep.store.attributes import segments_of
 from slatprep.store.contract import MAX_VOXELS, Finding, read_metadata
 from slatprep.store.integrity import file_findings, metadata_findings
@@ -135,7 +135,8 @@ def verify_store(
     Raises
     ------
     StoreError
-        If the store does not exist, or `sources` is set and their roots are unknown.
+        If the store does not exist, another one took its place meanwhile, or `sources` is set and
+        their roots are unknown.
     """
     path = storage_of(place_of(path)).current_version()
     try:
@@ -180,7 +181,17 @@ def verify_store(
             findings |= set(manifest_findings(store, folder, None if sample is None else rows))
         except StoreError as error:
             findings.add(Finding(str(folder), "", str(error), "records of a readable store"))
+    if findings and _was_replaced(store):
+        raise other_store(path)
     return Verification(path, total, files, hashed, folder, tuple(sorted(findings)))
+
+
+def _was_replaced(store: Store) -> bool:
+    """Return whether another store lies in its place by now, to which its digests do not apply."""
+    try:
+        return read_metadata(store.path / "zarr.json").get("attributes") != store.attributes
+    except StoreError:
+        return False
 
 
 def _chosen(total: int, sample: int | None) -> Sequence[int]:

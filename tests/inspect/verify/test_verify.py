@@ -17,6 +17,8 @@ from support.shapes import surface_latents
 from slatprep import StoreError, build_store, open_store
 from slatprep.inspect.verify import Finding, SourceRoots, index_findings, verify_store
 from slatprep.inspect.verify.manifests import manifest_findings
+from slatprep.pipeline.join import subset_store
+from slatprep.store.integrity import file_findings
 
 
 @pytest.fixture
@@ -39,6 +41,20 @@ def test_a_sound_store_has_no_findings(mixed_build):
     assert one.assets == 5
     assert one.files > 50
     assert one.manifests == mixed_build.records.parent
+
+
+def test_a_store_that_is_replaced_meanwhile_is_not_called_damaged(store, tmp_path, monkeypatch):
+    """The digests are those of the store that was opened."""
+    subset_store(store, tmp_path / "other.zarr", [0])
+
+    def replaced(*given: Any) -> Any:
+        store.rename(tmp_path / "older.zarr")
+        (tmp_path / "other.zarr").rename(store)
+        return file_findings(*given)
+
+    monkeypatch.setattr("slatprep.inspect.verify.file_findings", replaced)
+    with pytest.raises(StoreError, match="was the store replaced"):
+        verify_store(store)
 
 
 def test_a_sample_is_looked_at_and_nothing_else(store):
