@@ -183,6 +183,9 @@ class Pool(ABC):
         """Raise if no answer can come any more; called every second while none comes."""
 
 
+_QUIETLY = "ignore:resource_tracker:UserWarning"
+
+
 class _Processes(Pool):
     """Processes of this machine, which stay for the next call."""
 
@@ -236,7 +239,11 @@ def _interrupts_held() -> Iterator[None]:
         return
     from multiprocessing import resource_tracker
 
-    resource_tracker.ensure_running()  # Started with the first process, it would unblock SIGINT.
+    # Started with the first process, the tracker would unblock SIGINT. It removes the semaphores of
+    # killed processes, and would warn of them.
+    sys.warnoptions.append(_QUIETLY)
+    resource_tracker.ensure_running()
+    sys.warnoptions.remove(_QUIETLY)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

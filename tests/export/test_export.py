@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -320,6 +321,15 @@ def test_a_disk_that_is_full_ends_no_process(format, store, tmp_path):
     for line in lines:
         assert f"cannot be written to {tmp_path} (File too large); nothing was replaced" in line
         assert line.endswith(" []")
+
+
+def test_workers_that_are_ended_leave_no_warning_of_semaphores(store, tmp_path):
+    command = [sys.executable, "-m", "slatprep", "export", store, "--format", "ply", "--jobs", "2"]
+    limited = f"ulimit -f 40; {shlex.join(map(str, command))} --out {tmp_path}/e"
+    done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "(File too large); nothing was replaced" in line
 
 
 @pytest.mark.parametrize("format", KINDS)
