@@ -83,8 +83,8 @@ def find_consensus(transforms: ArrayLike, objects: Sequence[str]) -> Consensus |
 def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensus) -> Alignment:
     """Choose, among tied placements, the one nearest to the common rotation.
 
-    Return the same object if nothing is tied, no tied placement has the common rotation, some of
-    different scales have it, or another one is likelier.
+    Return the same object if nothing is tied, ties of one rotation have two scales, none has the
+    common rotation, or another one is likelier.
     """
     if not alignment.placements:
         return alignment
@@ -94,8 +94,9 @@ def settle(alignment: Alignment, latents: StructuredLatents, consensus: Consensu
     angles = degrees_between(rotations, consensus.rotation)
     chosen = int(np.argmin(angles))
     scales = np.log([scale for _, _, scale in split])
-    # A rotation does not choose between two scales.
-    others = (angles <= NEAR_DEGREES) & (abs(scales - scales[chosen]) > OTHER_SCALE)
+    # A rotation does not choose between two scales that tie in it, or in another rotation.
+    alike = degrees_between(rotations[:, None], rotations) <= NEAR_DEGREES
+    others = alike & (abs(scales[:, None] - scales) > OTHER_SCALE)
     if angles[chosen] > NEAR_DEGREES or others.any():
         return alignment
     odds, scores = _odds_of(consensus, rotations), np.array([tie.score for tie in ties])

@@ -41,9 +41,9 @@ times the misfit."""
 
 
 WELL, FAR, LACKING, LACKING_TAUS = 0.75, 3.0, 0.05, (1.0,) * 4
-"""Score of a similarity, distance in voxels, and difference of the shares of the two sides' samples
-that are off by more, above which a part lacks. The kernel is narrow then, or the trial would
-stretch the rest over that part."""
+"""A part lacks if the similarity scores more than `WELL`, and the shares of the two sides' samples
+that are off by more than `FAR` voxels differ by more than `LACKING`. The trial's kernels are narrow
+then, or it would stretch the rest over that part."""
 
 
 @dataclass(frozen=True)

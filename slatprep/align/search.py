@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slatprep.align.deform import try_out
+from slatprep.align.deform import TRIAL_SAMPLES, try_out
 from slatprep.align.pair import (
     COARSE,
     DISTINCT,
@@ -23,7 +23,8 @@ from slatprep.align.pair import (
     first_of_each,
     scale_penalty,
 )
-from slatprep.align.pose import Pose, Poses
+from slatprep.align.pose import Pose, Poses, Similarity
+from slatprep.align.residuals import Residuals
 from slatprep.align.starts import so3_starts
 from slatprep.align.stretch import stretch
 from slatprep.align.warp import Warp, from_nearest, places_of
@@ -42,9 +43,13 @@ share of the extent."""
 REPEATED, REPEATED_KEPT = Steps(40, (3.0, 2.0), 0.02), 24
 """First steps of such poses, and the number of poses that are refined further."""
 
-TRADED, TRADED_WITHIN = 0.015, 0.15
-"""Product of a scale's logarithm and an offset [voxel] from which a part may lack instead, and by
-how much a placement of scale one may score less then and still tie."""
+TRADED, TRADED_WITHIN = -0.015, 0.15
+"""A part may lack if a scale's logarithm times the offset [voxel] is below the first number. A
+placement of scale one may score less by the second number then and still tie."""
+
+FITS, MISSES, MOST_FIT = 0.6, 3.0, 0.85
+"""In that tie, over a share `MOST_FIT` of the samples that are off by less than `MISSES` voxels are
+off by less than `FITS`: all but the missing part fits."""
 
 SAME_SIZE = 0.05
 """Largest difference of the size ratio from one without a second set of starts at scale one."""
@@ -138,13 +143,20 @@ def of_scale_one(pair: Pair, best: Pose) -> list[Pose]:
     A tapered bar that lacks an end is a smaller bar with a thicker surface.
     """
     own = best.similarity
-    if not pair.free_scale or np.log(own.scale) * own.offset > -TRADED:
+    if not pair.free_scale or np.log(own.scale) * own.offset > TRADED:
         return []
     start = pair.at_scale_one(own)._replace(offset=0.0)
     shifts = start.shift + np.concatenate([np.zeros((1, 3)), _slides(pair)])
     starts = [Pose(start._replace(shift=shift)) for shift in shifts]
     others = pair.others(best, pair.refine(starts, POLISH._replace(free_scale=False)))
-    return [pose for pose in others if pose.score > best.score - TRADED_WITHIN]
+    near = [pose for pose in others if pose.score > best.score - TRADED_WITHIN]
+    return [pose for pose in near if _fits_but_for_a_part(pair, pose.similarity)]
+
+
+def _fits_but_for_a_part(pair: Pair, similarity: Similarity) -> bool:
+    residuals = Residuals(pair.slat, pair.pixie, similarity, TRIAL_SAMPLES)
+    off = np.abs(np.concatenate(residuals.at(Warp.unbent(similarity))))
+    return bool((off[off < MISSES] < FITS).mean() > MOST_FIT)
 
 
 def ranked(pair: Pair, poses: Sequence[Pose], halfway: Sequence[Pose]) -> list[Pose]:

@@ -65,7 +65,7 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A distinct placement that fits about as well as the best one.
+    """A distinct placement that fits about as well as the best one, or all of it but a part.
 
     ``displacement`` is the largest distance [voxel] between a SLAT voxel's positions in this
     placement and in the best one.
@@ -333,7 +333,7 @@ class Alignment:
     margin : float
         Distance in score from the best placement to the next distinct one.
     placements : tuple of Placement
-        Distinct placements that fit about as well.
+        Distinct placements that fit about as well, or would but for a missing part.
     score : float
         The engine's rank of placements, 1 for a perfect fit; NaN if it ranks by fitness alone.
     settled_by : Consensus, LatentChoice or None
